@@ -73,6 +73,16 @@ _NAMES: Final = {"center": "position", "label": "class"}
 _KINDS: Final = {"float": "a number", "int": "an integer", "str": "a text", "array": "a list", "object": "a map"}
 """Types of JSON by their names in errors of msgspec."""
 
+_MEANT: Final = {
+    **dict.fromkeys(("label", "name", "type", "category", "category_id", "class_name", "cls"), "class"),
+    **dict.fromkeys(("bbox", "bbox_2d", "box2d", "xyxy"), "box"),
+    **dict.fromkeys(("x", "center", "centre", "location", "translation"), "position"),
+    **dict.fromkeys(("latitude", "longitude"), "lat with lon"),
+    **dict.fromkeys(("timestamp", "t", "ts", "stamp", "datetime"), "time or stamp_ns"),
+    **dict.fromkeys(("detections", "predictions", "boxes", "tracks"), "objects"),
+}
+"""Names that other senders give fields, and ours: for errors alone."""
+
 _frames: Final = msgspec.json.Decoder(list[msgspec.Raw])
 _frame: Final = msgspec.json.Decoder(EdgeDetections)
 
@@ -200,7 +210,10 @@ class FrameReader:
             if fields.keys() & {"center", "label"}:
                 return self._columns(fields, stream)
             raise _invalid(error, fields) from None
-        except schemas.MessageError:
+        except schemas.MessageError as error:
+            if (at := _ELEMENT.fullmatch(error.path)) and error.received == "none":  # it says no place
+                received = _calls(msgspec.json.decode(payload)["objects"][int(at[2])], error.received)
+                raise schemas.MessageError(error.code, error.path, error.expected, received) from None
             raise
         except (ValueError, msgspec.DecodeError, RecursionError) as error:
             raise _malformed(error, payload) from None
@@ -513,6 +526,12 @@ def _of_object(
     return schemas.MessageError(error.code, f"objects[{number}].{name}{rest}", error.expected, received)
 
 
+def _calls(fields: Any, received: str) -> str:
+    """Return what was received, with our name for a field that other senders call otherwise."""
+    known = next((name for name in fields if name in _MEANT), None) if isinstance(fields, dict) else None
+    return received if known is None else f"{received}; {known} is {_MEANT[known]} here"
+
+
 def _malformed(error: Exception, payload: bytes) -> schemas.MessageError:
     text = "deeper nesting" if isinstance(error, RecursionError) else str(error).removeprefix("JSON is malformed: ")
     if "truncated" in text:
@@ -527,10 +546,12 @@ def _invalid(error: msgspec.ValidationError, document: Any) -> schemas.MessageEr
     for part in re.findall(r"\w+", path):
         document = document[int(part) if part.isdigit() else part]
     if match := re.fullmatch(r"Object missing required field `(.*)`", text):
-        return schemas.MessageError("missing_field", f"{path}.{match[1]}".removeprefix("."), "a value", "nothing")
+        received = _calls(document, "nothing")
+        return schemas.MessageError("missing_field", f"{path}.{match[1]}".removeprefix("."), "a value", received)
     if match := re.fullmatch(r"Object contains unknown field `(.*)`", text, re.DOTALL):
         expected = f"one of {', '.join(EdgeDetections.__struct_fields__)}"
-        return schemas.MessageError("invalid_value", show(match[1])[1:-1], expected, "another field")
+        received = _calls({match[1]: None}, "another field")
+        return schemas.MessageError("invalid_value", show(match[1])[1:-1], expected, received)
     expected = re.sub(r", got .*| \| null|`", "", text.removeprefix("Expected ")).replace(" | ", " or ")
     expected = re.sub(r"\w+", lambda word: _KINDS.get(word[0], word[0]), expected)
     if text.startswith("Invalid enum value"):

@@ -405,6 +405,25 @@ def test_an_error_names_the_path(fields: dict[str, Any], code: str, path: str) -
     assert (raised.value.code, raised.value.path) == (code, path)
 
 
+@pytest.mark.parametrize(
+    ("fields", "path", "ours"),
+    [
+        ({"objects": [{"label": "car", "position": [0, 0]}]}, "objects[0].class", "label is class here"),
+        ({"objects": [{"class": "car", "bbox": [0, 0, 9, 9]}]}, "objects[0]", "bbox is box here"),
+        ({"objects": [CAR, {"class": "car", "x": 1, "y": 2}]}, "objects[1]", "x is position here"),
+        ({"objects": [], "timestamp": 1.5}, "timestamp", "timestamp is time or stamp_ns here"),
+        ({"detections": [{"class": "car"}]}, "detections", "detections is objects here"),
+    ],
+)
+def test_an_error_says_our_name_of_a_field_that_others_call_otherwise(
+    fields: dict[str, Any], path: str, ours: str
+) -> None:
+    """Only where a field is missing or not known: names that mean nothing here are free."""
+    with pytest.raises(MessageError) as raised:
+        FrameReader(Settings()).read(json.dumps(fields).encode(), SENSOR.stream)
+    assert (raised.value.path, raised.value.received.rpartition("; ")[2]) == (path, ours)
+
+
 def test_vectors_of_objects_are_columns() -> None:
     """An object without one is unknown, and a frame that says nothing of other objects has one frame for each."""
     body = {"objects": [CAR | {"embedding": [3, 4]}, CAR], "embedding_model": "reid-7"}
