@@ -39,7 +39,7 @@ CALL_S: Final = 1.0  # how long the servers may take to answer; they take millis
 CONNECT_S: Final = 1
 RETRY_S: Final = 1  # both in whole seconds, as NATS' client has them typed
 MANY: Final = 3  # servers from which on everything is kept by three of them
-LEAST: Final = (2, 12)  # first version of the server that refuses a checkpoint for its fence
+LEAST: Final = (2, 12, 7)  # first version of the server that finds the checkpoint before one that was removed
 EXISTS: Final = 10058
 ENDS: Final = frozenset({"204", "404"})  # status that ends a batch: that was all, or there is nothing
 NOBODY: Final = "503"
@@ -185,7 +185,7 @@ class NatsConnection:
             # Nothing is put into the client's buffer: it would be sent after its caller has given up.
             raise NatsError(self._why)
         version = client.connected_server_version
-        if (version.major, version.minor) < LEAST:
+        if (version.major, version.minor, version.patch) < LEAST:
             raise NatsError(f"NATS {'.'.join(map(str, LEAST))} or newer is needed, this is {version}")
         return client
 
