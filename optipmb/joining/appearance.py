@@ -14,7 +14,12 @@ term
 
     log [p_same(d) / p_different(d)],   p(d) = (h_(d-1) + 2 h_d + h_(d+1)) / (4 sum h) + 1 / (2 n)
 
-within `BOUNDS`, where n is the smaller sum; nothing while that is below `LEAST_COUNTS`.
+within bounds, where n is the smaller sum; nothing while that is below `LEAST_COUNTS`.
+
+An object may look otherwise after a gap, from its other side. So distances over gaps are counted too, of the pairs that
+are sure by motion alone. From `LEAST_GAPS` of these on, they take the place of the distances within a track. Before, a
+distance counts against a join by no more than `UNSURE`, and not at all while most of these are rather distances of
+different objects.
 """
 
 from __future__ import annotations
@@ -47,7 +52,12 @@ OTHERS: Final = 8
 LEAST_COUNTS: Final = 200
 MOST_COUNTS: Final = 10_000
 """Counts of a histogram at which it is halved."""
+LEAST_GAPS: Final = 100
+MANY_GAPS: Final = 2000
 BOUNDS: Final = (-6.0, 4.0)
+UNSURE: Final = -1.0
+MANY: Final = 8.0
+"""Least and largest term, least one before `LEAST_GAPS`, and largest one from `MANY_GAPS` on."""
 _NS: Final = 1e-9
 _SEEN: Final = 0
 _FIRST: Final = 1
@@ -63,7 +73,7 @@ class Vectors(NamedTuple):
         total: (U, W) `Appearance.total`.
         lost_id: (L,) int64, ascending, of the objects that were lost before the frame.
         lost: (L, W) `Appearance.lost`.
-        counts: (C, 2, `DISTANCES`) `Appearance.counts`.
+        counts: (C, 3, `DISTANCES`) `Appearance.counts`; those over gaps are counted by the decisions of a frame.
     """
 
     id: Index
@@ -75,7 +85,7 @@ class Vectors(NamedTuple):
 
 _NO_IDS: Final = np.zeros(0, np.int64)
 _NO_VECTORS: Final = np.zeros((0, 0), np.float32)
-NOTHING: Final = Vectors(_NO_IDS, _NO_VECTORS, _NO_IDS, _NO_VECTORS, np.zeros((0, 2, DISTANCES)))
+NOTHING: Final = Vectors(_NO_IDS, _NO_VECTORS, _NO_IDS, _NO_VECTORS, np.zeros((0, 3, DISTANCES)))
 """Where no detection has brought a vector."""
 
 
@@ -113,20 +123,39 @@ def vector_of(vectors: Vectors, identity: int) -> Singles:
 @kernel
 def appearance_score(vectors: Vectors, i: int, j: int, kind: int) -> float:
     """Return log [p_same(d) / p_different(d)] of two ids of a kind; 0 where it is not known."""
-    same, different = vectors.counts[kind, 0].sum(), vectors.counts[kind, 1].sum()
+    counts = vectors.counts[kind]
+    within, different, gaps = counts[0].sum(), counts[1].sum(), counts[2].sum()
+    over = gaps >= LEAST_GAPS
+    same = gaps if over else within
     least = min(same, different)
-    if least < LEAST_COUNTS:
+    if min(within, different) < LEAST_COUNTS:
         return 0.0
     d = distance(vector_of(vectors, i), vector_of(vectors, j), 0.0)
     if math.isnan(d):
         return 0.0
     at = bin_of(d)
     below, above = max(at - 1, 0), min(at + 1, DISTANCES - 1)
-    p, q = vectors.counts[kind, 0], vectors.counts[kind, 1]
+    p, q = counts[2 if over else 0], counts[1]
     ratio = (0.25 * (p[below] + 2.0 * p[at] + p[above]) / same + 0.5 / least) / (
         0.25 * (q[below] + 2.0 * q[at] + q[above]) / different + 0.5 / least
     )
-    return min(max(math.log(ratio), BOUNDS[0]), BOUNDS[1])
+    least_term = BOUNDS[0]
+    if not over:
+        alike = 0.0
+        for k in range(DISTANCES):
+            alike += counts[2, k] * (p[k] * different > q[k] * within)
+        least_term = UNSURE if alike >= 0.5 * gaps else 0.0
+    return min(max(math.log(ratio), least_term), MANY if gaps >= MANY_GAPS else BOUNDS[1])
+
+
+@kernel
+def count_distance(vectors: Vectors, i: int, j: int, kind: int) -> None:
+    """Count the distance of two ids of a kind over a gap."""
+    d, counts = distance(vector_of(vectors, i), vector_of(vectors, j), 0.0), vectors.counts[kind, 2]
+    if not math.isnan(d):
+        counts[bin_of(d)] += 1.0
+        if counts.sum() >= MOST_COUNTS:
+            counts *= 0.5
 
 
 @kernel

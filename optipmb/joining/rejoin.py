@@ -13,7 +13,9 @@ probability that it was new; those of what is there when a session or one of its
 
 Exits and passages may be declared. What is lost in an exit does not return, and what begins there is new. An object
 that is lost at the start of a passage may be seen again at its end after a time within bounds, which adds a part to
-p(y, T | i): most objects keep their speed on the way, the time of the others is uniform.
+p(y, T | i): most objects keep their speed on the way, the time of the others is uniform. Passages that are not declared
+are learned: each beginning is kept with the tracks that it may continue, weighted by the odds of these. What was lost
+near the place of one returns near the place of the other, after a time in proportion to the speeds.
 
 The joins are the matching of ends and beginnings with the largest sum of positive s_ij. A join has the probability
 1 / (1 + exp(-m)) with the margin m: the largest sum less the largest one without that pair. Two equal candidates have
@@ -33,12 +35,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.joining.appearance import NOTHING, Vectors, aligned, appearance_score, seen
+from optipmb.joining.appearance import NOTHING, Vectors, aligned, appearance_score, count_distance, seen
 from optipmb.model.class_names import common_name
 from optipmb.model.density import OMEGA, objects_in
 from optipmb.model.errors import ParameterError
 from optipmb.model.frame import LONGEST_MODEL
-from optipmb.model.lost_objects import PLACES, Beginnings, Lost, Places, Rejoining, Statistics, Tracklets
+from optipmb.model.lost_objects import PLACES, Beginnings, Lost, Places, Rejoining, Returns, Statistics, Tracklets
 from optipmb.model.polygons import check_polygon, inside
 from optipmb.model.rows import arrays_of, views_of
 from optipmb.model.tracks import Tracks, tracks_in
@@ -112,12 +114,24 @@ MOST_CORNERS: Final = 100
 RETURNS_BY_PASSAGE: Final = 0.9
 PACE: Final = 0.12
 """Standard deviation of the speed in a passage from the one before or behind it, relative."""
-BY_PACE: Final = 0.8
+SURE: Final = 4.6
+"""Score from which a pair is sure by motion alone, above 0 and above all others of both tracks."""
+BY_PACE: Final = 0.95
 """Share of the objects in a passage that keep their speed; the time of the others is uniform within the bounds."""
 RIVAL_NS: Final = 3 * 10**9
 """Tracks that began so lately compete for lost objects."""
 LEAST_SIZES: Final = 5
 """Tracks of a class from which its sizes count while tracking."""
+LEARNED_NS: Final = 600 * 10**9
+"""Time in which returns teach where others return."""
+ELSEWHERE_M: Final = 6.0
+"""Returns nearer to where they were lost teach nothing: motion says more, and at a door others come out."""
+LEARNED: Final = 0.8
+"""Share of the returns that are as those of others, if many are known; it is half from"""
+FIRST_RETURNS: Final = 0.5
+"""this sum of weights on."""
+LEAST_WEIGHT: Final = 0.002
+MOST_RETURNS: Final = 500
 MOST_BEGINNINGS: Final = 2000
 MOST_SCORES: Final = 20_000
 MOST_PAIRS: Final = 4000
@@ -207,6 +221,8 @@ PlaceArrays: Final = arrays_of(Places, "PlaceArrays", __name__)
 places_in: Final = views_of(Places, PlaceArrays, "places_in", __file__)
 BeginningArrays: Final = arrays_of(Beginnings, "BeginningArrays", __name__)
 beginnings_in: Final = views_of(Beginnings, BeginningArrays, "beginnings_in", __file__)
+ReturnArrays: Final = arrays_of(Returns, "ReturnArrays", __name__)
+returns_in: Final = views_of(Returns, ReturnArrays, "returns_in", __file__)
 StatisticArrays: Final = arrays_of(Statistics, "StatisticArrays", __name__)
 statistics_in: Final = views_of(Statistics, StatisticArrays, "statistics_in", __file__)
 
@@ -218,9 +234,11 @@ def _layout(rows: type[Rows]) -> Index:
 _TRACKLET: Final = Tracklets.width
 _PLACE: Final = Places.width
 _BEGINNING: Final = Beginnings.width
+_RETURN: Final = Returns.width
 _TRACKLETS: Final = _layout(Tracklets)
 _PLACES: Final = _layout(Places)
 _BEGINNINGS: Final = _layout(Beginnings)
+_RETURNS: Final = _layout(Returns)
 """First word and words of each column."""
 
 
@@ -420,6 +438,39 @@ def _pace(before: tuple[Array, float], after: tuple[Array, float]) -> tuple[floa
 
 
 @kernel
+def _log_normal(x: float, median: float, deviation: float) -> float:
+    return math.exp(-0.5 * (math.log(x / median) / deviation) ** 2) / (math.sqrt(2.0 * math.pi) * deviation * x)
+
+
+@kernel
+def learned_score(i: Tracklets, n: int, j: Tracklets, k: int, kind: int, returns: Returns) -> tuple[float, float]:
+    """Return log p(y, T | i) by the returns of others from near row `n`, -inf where none is known, and its weight."""
+    x, y = j.begin[k, 0] - i.end[n, 0], j.begin[k, 1] - i.end[n, 1]
+    if returns.id.shape[0] == 0 or x**2 + y**2 < ELSEWHERE_M**2:
+        return -math.inf, 0.0
+    t, total, weights, far = (j.first_ns[k] - i.last_ns[n]) * _NS, 0.0, 0.0, (5.0 * KERNEL_M) ** 2
+    speed, deviation = _pace((i.end_velocity[n], i.end_variance[n]), (j.begin_velocity[k], j.begin_variance[k]))
+    for r in range(returns.id.shape[0]):
+        x, y = returns.start[r, 0] - i.end[n, 0], returns.start[r, 1] - i.end[n, 1]
+        square = x**2 + y**2
+        if square > far or returns.kind[r] != kind or returns.id[r] == j.id[k]:
+            continue
+        weight = returns.weight[r] * math.exp(-0.5 * square / KERNEL_M**2)
+        weights += weight
+        x, y = returns.end[r, 0] - j.begin[k, 0], returns.end[r, 1] - j.begin[k, 1]
+        square = x**2 + y**2
+        if square > far:
+            continue
+        ratio = returns.speed[r] / speed
+        known = ratio > 0.0
+        spread = math.sqrt(deviation**2 + PACE**2) if known else 2.0 * PACE
+        time = _log_normal(t, returns.seconds[r] * (ratio if known else 1.0), spread)
+        total += weight * time * math.exp(-0.5 * square / KERNEL_M**2) / (2.0 * math.pi * KERNEL_M**2)
+    share = LEARNED * weights / (weights + FIRST_RETURNS)
+    return math.log(RETURNS * share * total / weights) if total > 0.0 else -math.inf, share
+
+
+@kernel
 def passage_score(i: Tracklets, n: int, j: Tracklets, k: int, declared: Declared) -> float:
     """Return log p(y, T | i, a declared passage) of row `n` before it and row `k` behind it; -inf: there is none."""
     t, total, passages = (j.first_ns[k] - i.last_ns[n]) * _NS, 0.0, declared.area.shape[0]
@@ -433,9 +484,7 @@ def passage_score(i: Tracklets, n: int, j: Tracklets, k: int, declared: Declared
         known = (i.end_velocity[n], i.end_variance[n]), (j.begin_velocity[k], j.begin_variance[k])
         speed, deviation = _pace(known[0], known[1])
         if way > 0.0 and speed > 0.0:
-            square = (math.log(t * speed / way) / deviation) ** 2
-            density *= 1.0 - BY_PACE
-            density += BY_PACE * math.exp(-0.5 * square) / (math.sqrt(2.0 * math.pi) * deviation * t)
+            density = (1.0 - BY_PACE) * density + BY_PACE * _log_normal(t, way / speed, deviation)
         total += RETURNS_BY_PASSAGE * density / declared.area[q]
     return math.log(total) if total > 0.0 else -math.inf
 
@@ -842,20 +891,20 @@ def _newest(stamp_ns: Index, most: int) -> Index:
 
 @kernel
 def _scores(
-    tables: tuple[Tracklets, Tracklets, Beginnings, Statistics],
+    tables: tuple[Tracklets, Tracklets, Beginnings, Returns, Statistics],
     ends: Index,
     young: Index,
     due: Flags,
     moment: tuple[int, float],
     kinds: Columns,
     vectors: Vectors,
-) -> Array:
-    """Return s_ij (E, M) of ends and beginnings, NaN or -inf where they are not joined.
+) -> tuple[Array, Array]:
+    """Return s_ij (E, M) of ends and beginnings, NaN or -inf where they are not joined, and its part by appearance.
 
     Only what is connected with a decision by pairs that may be joined is scored.
 
     Args:
-        tables: lost objects, live tracks, beginnings and statistics of classes.
+        tables: lost objects, live tracks, beginnings, returns and statistics of classes.
         ends: (E,) rows of the lost objects and, behind these, of live tracks.
         young: (M,) rows of live tracks that began lately.
         due: (M,) those on which to decide.
@@ -863,9 +912,9 @@ def _scores(
         kinds: the fields of `Kinds`.
         vectors: of the tracks and of the lost objects.
     """
-    (lost, live, begun, known), (motion, kind, area, plan), (stamp_ns, gap_s) = tables, kinds, moment
+    (lost, live, begun, returns, known), (motion, kind, area, plan), (stamp_ns, gap_s) = tables, kinds, moment
     declared, many = Declared(*plan), lost.id.shape[0]
-    score = np.full((ends.shape[0], young.shape[0]), math.nan)
+    score, looks = np.full((ends.shape[0], young.shape[0]), math.nan), np.zeros((ends.shape[0], young.shape[0]))
     wanted, used, grows = due.copy(), np.zeros(ends.shape[0], np.bool_), True
     news = np.zeros(area.shape[0])
     for n in range(begun.id.shape[0]):
@@ -887,23 +936,59 @@ def _scores(
                 table, n = (lost, ends[at]) if ends[at] < many else (live, ends[at] - many)
                 value = pair_score(table, n, live, k, kind, motion, gap_s)
                 if value > -math.inf:
-                    value = _log_sum(value, passage_score(table, n, live, k, declared))
+                    way, share = passage_score(table, n, live, k, declared), 0.0
+                    if way == -math.inf:
+                        way, share = learned_score(table, n, live, k, c, returns)
+                    value = _log_sum(value + math.log1p(-share), way)
                     sizes = known.count[c], known.mean[c], known.square[c]
                     value += size_score(table.size[n], live.size[k], sizes[0], sizes[1], sizes[2], LEAST_SIZES)
                     if vectors.total.shape[1] > 0:
-                        value += appearance_score(vectors, table.id[n], live.id[k], c)
-                if value > least_log and not _in_exit(declared, table.end[n]):
+                        looks[at, m] = appearance_score(vectors, table.id[n], live.id[k], c)
+                if value + max(looks[at, m], 0.0) > least_log and not _in_exit(declared, table.end[n]):
                     if math.isnan(log_rate):
                         around = _around(begun, c, live.id[k], live.begin[k, 0], live.begin[k, 1])
                         log_rate = math.log(0.5 * (everywhere + around) / seconds)
-                    value = round((value - log_rate) / QUANTUM) * QUANTUM
+                    value = round((value + looks[at, m] - log_rate) / QUANTUM) * QUANTUM
                 else:
                     value = -math.inf
                 score[at, m] = value
                 if value > 0.0:
                     grows |= not (wanted[m] and used[at])
                     wanted[m] = used[at] = True
-    return score
+    return score, looks
+
+
+@kernel
+def _count_gaps(
+    score: Array,
+    tables: tuple[Tracklets, Tracklets],
+    ends: Index,
+    young: Index,
+    due: Flags,
+    kind: Index,
+    vectors: Vectors,
+) -> None:
+    """Count the distances of pairs that are sure by their scores without appearance."""
+    lost, live = tables
+    many = lost.id.shape[0]
+    for m in np.flatnonzero(due):
+        best = -1
+        for at in range(ends.shape[0]):
+            if score[at, m] >= SURE and (best < 0 or score[at, m] > score[best, m]):
+                best = at
+        if best < 0:
+            continue
+        rest = 0.0
+        for at in range(ends.shape[0]):
+            if at != best and score[at, m] > rest:
+                rest = score[at, m]
+        for other in range(young.shape[0]):
+            if other != m and score[best, other] > rest:
+                rest = score[best, other]
+        if score[best, m] - rest >= SURE:
+            k = young[m]
+            one = lost.id[ends[best]] if ends[best] < many else live.id[ends[best] - many]
+            count_distance(vectors, one, live.id[k], kind[live.label[k]])
 
 
 @kernel
@@ -949,19 +1034,61 @@ def _with_beginnings(
 
 
 @kernel
+def _with_returns(
+    return_words: Array,
+    tables: tuple[Tracklets, Tracklets],
+    ends: Index,
+    young: Index,
+    score: Array,
+    stamp_ns: int,
+    kind: Index,
+) -> Array:
+    """Return the words of the returns of the last time, and of pairs (E, M) with their scores."""
+    lost, live = tables
+    many, returns = lost.id.shape[0], returns_in(return_words)
+    weight = np.zeros(score.shape)
+    for m in range(young.shape[0]):
+        total = 1.0
+        for at in range(ends.shape[0]):
+            table, n = (lost, ends[at]) if ends[at] < many else (live, ends[at] - many)
+            x, y = live.begin[young[m], 0] - table.end[n, 0], live.begin[young[m], 1] - table.end[n, 1]
+            if score[at, m] > -math.inf:
+                weight[at, m] = math.exp(score[at, m]) if x**2 + y**2 >= ELSEWHERE_M**2 else 0.0
+                total += math.exp(score[at, m])
+        weight[:, m] /= total
+    before, after = np.nonzero(weight >= LEAST_WEIGHT)
+    recent = np.flatnonzero(returns.stamp_ns >= stamp_ns - LEARNED_NS)
+    recent = recent[max(0, recent.shape[0] + before.shape[0] - MOST_RETURNS) :]
+    before, after = before[:MOST_RETURNS], after[:MOST_RETURNS]
+    more = np.empty((recent.shape[0] + before.shape[0]) * _RETURN)
+    found = returns_in(more)
+    _copy(return_words, recent, more, np.arange(recent.shape[0]), _RETURNS)
+    for p in range(before.shape[0]):
+        at, k, end = recent.shape[0] + p, young[after[p]], ends[before[p]]
+        table, n = (lost, end) if end < many else (live, end - many)
+        found.id[at], found.kind[at], found.stamp_ns[at] = live.id[k], kind[live.label[k]], live.first_ns[k]
+        found.start[at], found.end[at] = table.end[n], live.begin[k]
+        found.seconds[at] = (live.first_ns[k] - table.last_ns[n]) * _NS
+        later = live.begin_velocity[k], live.begin_variance[k]
+        found.speed[at] = _pace((table.end_velocity[n], table.end_variance[n]), later)[0]
+        found.weight[at] = weight[before[p], after[p]]
+    return more
+
+
+@kernel
 def decide(
-    given: tuple[Array, Array, Array, Array],
+    given: tuple[Array, Array, Array, Array, Array],
     young: Index,
     due: Flags,
     stamp_ns: int,
     kinds: Columns,
     limits: tuple[float, float],
     vectors: Vectors,
-) -> tuple[Array, Array, Index]:
+) -> tuple[Array, Array, Array, Index]:
     """Decide on new tracks: write their objects to the words of the live tracks, and sizes to the words of the classes.
 
     Args:
-        given: words of the live tracks, the lost objects, the beginnings and the classes.
+        given: words of the live tracks, the lost objects, the beginnings, the returns and the classes.
         young: (M,) rows of live tracks that began lately.
         due: (M,) those on which to decide.
         stamp_ns: of the frame.
@@ -970,17 +1097,21 @@ def decide(
         vectors: of the tracks and of the lost objects.
 
     Returns:
-        The words of the lost objects and of the beginnings, and the rows of live tracks that were joined: they are not
-        detected any more, and end.
+        The words of the lost objects, the beginnings and the returns, and the rows of live tracks that were joined:
+        they are not detected any more, and end.
     """
-    live_words, lost_words, begun_words, class_words = given
+    live_words, lost_words, begun_words, return_words, class_words = given
     live, lost, known = tracklets_in(live_words), tracklets_in(lost_words), statistics_in(class_words)
     kind, many = kinds[1], lost.id.shape[0]
     coasting = np.flatnonzero((live.object >= 0) & (live.last_ns < stamp_ns))
     ends = np.concatenate((np.arange(many), many + coasting))
     ends = ends[_newest(np.concatenate((lost.last_ns, live.last_ns[coasting])), MOST_SCORES // max(young.shape[0], 1))]
-    tables = lost, live, beginnings_in(begun_words), known
-    score = _scores(tables, ends, young, due, (stamp_ns, limits[0]), kinds, vectors)
+    tables = lost, live, beginnings_in(begun_words), returns_in(return_words), known
+    score, looks = _scores(tables, ends, young, due, (stamp_ns, limits[0]), kinds, vectors)
+    if vectors.total.shape[1] > 0:
+        _count_gaps(score - looks, (lost, live), ends, young, due, kind, vectors)
+    decided = np.flatnonzero(due)
+    return_words = _with_returns(return_words, (lost, live), ends, young[decided], score[:, decided], stamp_ns, kind)
     before, after = np.nonzero(score > 0.0)
     gain = np.empty(before.shape[0])
     for p in range(before.shape[0]):
@@ -990,7 +1121,6 @@ def decide(
         before, after, gain = before[best], after[best], gain[best]
     taken, margin, odds = match(before, after, gain, due, ends.shape[0])
     kept, gone = np.ones(many, np.bool_), np.zeros(live.id.shape[0], np.bool_)
-    decided = np.flatnonzero(due)
     for k in young[decided]:
         _measure(known, kind[live.label[k]], live.size[k])
         live.object[k] = live.id[k]
@@ -1008,7 +1138,7 @@ def decide(
     if not kept.all():
         lost_words = _selected(lost_words, np.flatnonzero(kept), _TRACKLETS)
     begun_words = _with_beginnings(begun_words, live, young[decided], odds[decided], stamp_ns, kinds, known)
-    return lost_words, begun_words, np.flatnonzero(gone)
+    return lost_words, begun_words, return_words, np.flatnonzero(gone)
 
 
 @kernel
@@ -1018,7 +1148,7 @@ def advance(
     kinds: Columns,
     limits: tuple[float, float, float, int],
     vectors: Columns,
-) -> tuple[Array, Array, Array, Array, Array, Index, Array, Index, int, int]:
+) -> tuple[Array, Array, Array, Array, Array, Array, Index, Array, Index, int, int]:
     """Return the words of `Rejoining` after a frame.
 
     Args:
@@ -1033,7 +1163,7 @@ def advance(
         they were not detected; and the numbers of joins and of lost objects that were dropped because there were too
         many.
     """
-    live_words, place_words, lost_words, begun_words, class_words = given
+    live_words, place_words, lost_words, begun_words, return_words, class_words = given
     gap_s, least, decide_s, most = limits
     track_words, object_words, stamp_ns = moment
     live_words, place_words, lost_words = follow(
@@ -1062,8 +1192,8 @@ def advance(
     if decides:
         class_words = class_words.copy()
         had = live.object.copy()
-        lost_words, begun_words, rows = decide(
-            (live_words, lost_words, begun_words, class_words),
+        lost_words, begun_words, return_words, rows = decide(
+            (live_words, lost_words, begun_words, return_words, class_words),
             young[:rivals],
             due[:rivals],
             stamp_ns,
@@ -1094,7 +1224,8 @@ def advance(
             k += 1
         if k < live.id.shape[0] and live.id[k] == shown.id[n]:
             objects[n], probability[n] = live.object[k], live.probability[k]
-    return live_words, place_words, lost_words, begun_words, class_words, objects, probability, ends, joined, dropped
+    words = live_words, place_words, lost_words, begun_words, return_words, class_words
+    return *words, objects, probability, ends, joined, dropped
 
 
 class Joined(NamedTuple):
@@ -1141,7 +1272,8 @@ def rejoin_tracks(
         FrameError: vectors of another length than before.
     """
     state = before or Rejoining.empty(len(kinds.kind), density.stamp_ns)
-    given = tuple(one.words for one in (state.live, state.places, state.lost, state.beginnings, state.classes))
+    parts = state.live, state.places, state.lost, state.beginnings, state.returns, state.classes
+    given = tuple(one.words for one in parts)
     gap_s = settings.gap_s if density.sensor_motion is None else 0.0
     limits = gap_s, settings.min_probability, settings.decide_s, settings.most
     looks, vectors, (chosen, measurement) = None, NOTHING, detections
@@ -1160,8 +1292,8 @@ def rejoin_tracks(
         limits,
         tuple(vectors),
     )
-    live, places, lost, begun, known = words
-    after = Rejoining(Tracklets.of(live), Places.of(places), Lost.of(lost), Beginnings.of(begun), Statistics.of(known))
+    kinds_of = Tracklets, Places, Lost, Beginnings, Returns, Statistics
+    after = Rejoining(*(kind.of(one) for kind, one in zip(kinds_of, words, strict=True)))  # type: ignore[arg-type]
     if looks is not None:
         after = replace(after, appearance=aligned(*looks, state.lost, after.live, after.lost))
     density = replace(density, rejoining=after)

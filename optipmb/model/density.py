@@ -22,7 +22,17 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.model.errors import DensityError
-from optipmb.model.lost_objects import EMBEDDING, Appearance, Beginnings, Lost, Places, Rejoining, Statistics, Tracklets
+from optipmb.model.lost_objects import (
+    EMBEDDING,
+    Appearance,
+    Beginnings,
+    Lost,
+    Places,
+    Rejoining,
+    Returns,
+    Statistics,
+    Tracklets,
+)
 from optipmb.model.rows import Column, Rows, arrays_of, record, shown, views_of
 
 if TYPE_CHECKING:
@@ -297,7 +307,7 @@ SENSOR: Final = "sensor"
 MOST_COUNTED: Final = 1e9
 """Bound of stored counts of scores and of the sensor's motion, far above all that the tracker makes."""
 
-JOINING: Final = (Tracklets, Places, Lost, Beginnings, Statistics)
+JOINING: Final = (Tracklets, Places, Lost, Beginnings, Returns, Statistics)
 """Records of `Density.rejoining`, in the order of its fields."""
 
 APPEARANCE: Final = "rejoin.appearance"
@@ -360,7 +370,7 @@ def columns_of(density: Density) -> dict[str, NDArray[Any]]:
 
 def _records(density: Density) -> list[Rows]:
     own = density.rejoining
-    joining = () if own is None else (own.live, own.places, own.lost, own.beginnings, own.classes)
+    joining = () if own is None else (own.live, own.places, own.lost, own.beginnings, own.returns, own.classes)
     return [rows for rows in (density.bernoulli, density.poisson, density.misses, *joining) if rows is not None]
 
 
@@ -514,8 +524,8 @@ def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], labels: 
 
 def _rejoining(columns: Mapping[str, Any], stamp_ns: int, next_id: int, classes: int) -> Rejoining:
     """Return the state of the joining of tracks, whose rows fit together."""
-    live, places, lost, begun, known = (_rows(kind, columns) for kind in JOINING)
-    found = Rejoining(live, places, lost, begun, known)  # type: ignore[arg-type]  # in this order
+    live, places, lost, begun, returns, known = (_rows(kind, columns) for kind in JOINING)
+    found = Rejoining(live, places, lost, begun, returns, known)  # type: ignore[arg-type]  # in this order
     for rows in (found.live, found.lost):
         for name, column, low, high in (
             ("id", np.diff(rows.id, prepend=0), 1, next_id),
@@ -541,6 +551,9 @@ def _rejoining(columns: Mapping[str, Any], stamp_ns: int, next_id: int, classes:
         (f"{Places.part}.count", found.places.count, MOST_COUNTED),
         (f"{Beginnings.part}.kind", found.beginnings.kind, classes - 1),
         (f"{Beginnings.part}.stamp_ns", found.beginnings.stamp_ns, stamp_ns),
+        (f"{Returns.part}.kind", found.returns.kind, classes - 1),
+        (f"{Returns.part}.stamp_ns", found.returns.stamp_ns, stamp_ns),
+        (f"{Returns.part}.weight", found.returns.weight, 1),
     ):
         if column.size and not 0 <= column.min() <= column.max() <= most:
             raise DensityError(path, f"from 0 to {most}", f"{column.min()} to {column.max()}")

@@ -112,6 +112,33 @@ class Beginnings(Rows):
     new = Column(np.float64)
 
 
+class Returns(Rows):
+    """Beginnings with what they may continue: where and after which time objects return that are lost at a place.
+
+    Attributes:
+        id: (N,) int64 of the track that began.
+        kind: (N,) int64 first class of its group.
+        stamp_ns: (N,) int64 of its first detection.
+        start: (N, 2) last place of the other, m.
+        end: (N, 2) first place of this one.
+        seconds: (N,) between.
+        speed: (N,) before and behind, m/s, NaN where unknown.
+        weight: (N,) probability that it continued the other.
+    """
+
+    part = "rejoin.returns"
+    __slots__ = ()
+
+    id = Column(np.int64)
+    kind = Column(np.int64)
+    stamp_ns = Column(np.int64)
+    start = Column(np.float64, 2)
+    end = Column(np.float64, 2)
+    seconds = Column(np.float64)
+    speed = Column(np.float64)
+    weight = Column(np.float64)
+
+
 class Statistics(Rows):
     """Of each class (C,); the row of its first class holds a group.
 
@@ -145,7 +172,7 @@ class Appearance:
         first: (N, W) float32 the same when it was decided.
         stamp_ns: (N, 3) int64 of the last vector, of `first` and of the last distance that was counted; -1: none.
         lost: (L, W) float32 `total` of each lost object.
-        counts: (C, 2, `DISTANCES`) distances of the same object and of different ones.
+        counts: (C, 3, `DISTANCES`) distances of the same object in view, of different ones, and of one over a gap.
     """
 
     model: Index
@@ -165,7 +192,7 @@ class Appearance:
             "first": ((live, width), np.float32),
             "stamp_ns": ((live, 3), np.int64),
             "lost": ((lost, width), np.float32),
-            "counts": ((classes, 2, DISTANCES), np.float64),
+            "counts": ((classes, 3, DISTANCES), np.float64),
         }
 
     @classmethod
@@ -187,6 +214,7 @@ class Rejoining:
     places: Places
     lost: Lost
     beginnings: Beginnings
+    returns: Returns
     classes: Statistics
     appearance: Appearance | None = None
 
@@ -196,7 +224,7 @@ class Rejoining:
         none = np.zeros((classes, 3))
         since = np.full(classes, stamp_ns)
         known = Statistics(since_ns=since, settled_ns=since + SETTLES_NS, count=none, mean=none, square=none)
-        return cls(Tracklets.empty(), Places.empty(), Lost.empty(), Beginnings.empty(), known)
+        return cls(Tracklets.empty(), Places.empty(), Lost.empty(), Beginnings.empty(), Returns.empty(), known)
 
     def with_sensor(self, stamp_ns: int) -> Rejoining:
         """Return the state before the first frame of another sensor, which sees what was there before."""

@@ -48,7 +48,7 @@ class Twin:
         self.first: dict[int, tuple[int, Floats]] = {}
         self.counted: dict[int, int] = {}
         self.decided: set[int] = set()
-        self.counts = np.zeros((3, 2, DISTANCES))
+        self.counts = np.zeros((3, 3, DISTANCES))
 
     def follow(self, result: optipmb.StepResult, given: dict[str, Any]) -> None:
         """Follow the tracks of a frame."""
@@ -98,16 +98,24 @@ def test_vectors_and_counts_are_those_of_plain_numpy() -> None:
     assert np.abs(found.counts - twin.counts).sum() <= 4  # a distance at the edge of a bin
 
 
-def test_the_score_is_the_smoothed_ratio() -> None:
-    """Of the histograms by hand, within its bounds; nothing below 200 counts, and without one of the vectors."""
+@pytest.mark.parametrize(
+    ("sure", "alike", "bounds"),
+    [(0, True, (-1.0, 4.0)), (50, False, (0.0, 4.0)), (50, True, (-1.0, 4.0)), (100, True, (-6.0, 4.0)),
+     (2000, True, (-6.0, 8.0))],
+)  # fmt: skip
+def test_the_score_is_the_smoothed_ratio(sure: int, alike: bool, bounds: tuple[float, float]) -> None:  # noqa: FBT001
+    """Of the histograms by hand, within bounds that widen with sure joins; nothing for few counts or no vector."""
     chance = np.random.default_rng(5)
-    counts = np.zeros((1, 2, DISTANCES))
+    counts = np.zeros((1, 3, DISTANCES))
     counts[0, 0, 4:12], counts[0, 1, 9:20] = chance.integers(20, 60, 8), chance.integers(100, 400, 11)
     lost = chance.standard_normal((1, 6)).astype(np.float32)
-    same, different = counts[0]
-    padded = np.pad(counts[0], ((0, 0), (1, 1)), mode="edge")
-    smooth = 0.25 * (padded[:, :-2] + 2.0 * counts[0] + padded[:, 2:]) / counts[0].sum(axis=1, keepdims=True)
-    ratio = (smooth[0] + 0.5 / same.sum()) / (smooth[1] + 0.5 / same.sum())
+    counts[0, 1] *= 10.0
+    same, different, _ = counts[0]
+    counts[0, 2, 5 if alike else 18] = sure
+    used = np.stack((counts[0, 2] if sure >= 100 else same, different))
+    padded = np.pad(used, ((0, 0), (1, 1)), mode="edge")
+    smooth = 0.25 * (padded[:, :-2] + 2.0 * used + padded[:, 2:]) / used.sum(axis=1, keepdims=True)
+    ratio = (smooth[0] + 0.5 / used[0].sum()) / (smooth[1] + 0.5 / used[0].sum())
     found = set()
     for angle in np.linspace(0.01, np.pi - 0.01, 40):
         aside = direction(np.linalg.qr(np.column_stack((lost[0], chance.standard_normal(6))))[0][:, 1])
@@ -115,13 +123,30 @@ def test_the_score_is_the_smoothed_ratio() -> None:
         live = np.array([one], np.float32)
         vectors = Vectors(np.array([9]), live, np.array([2]), lost, counts)
         at = int(np.sin(0.5 * angle) * DISTANCES)
-        expected = np.clip(np.log(ratio[at]), -6.0, 4.0)
+        expected = np.clip(np.log(ratio[at]), *bounds)
         assert appearance_score(vectors, 2, 9, 0) == pytest.approx(expected, rel=1e-5)
         found.add(np.sign(expected))
-        few = vectors._replace(counts=np.stack([[199.0 * same / same.sum(), different]]))
+        few = vectors._replace(counts=np.stack([[199.0 * same / same.sum(), different, counts[0, 2]]]))
         assert appearance_score(few, 2, 9, 0) == 0.0
         assert appearance_score(vectors._replace(total=np.zeros_like(live)), 2, 9, 0) == 0.0
-    assert {-1.0, 1.0} <= found
+    assert {np.sign(bounds[0]), 1.0} <= found
+
+
+def test_sure_joins_count_the_distances_over_gaps() -> None:
+    """Vectors of another side behind a gap are counted where motion alone is sure, and cost no join."""
+    recording = gaps.record("car park", 8, 60.0)
+    turned = gaps.with_vectors(recording, 4.0, numbers=15, lasts=True)
+    found = []
+    for frames, how in ((recording.frames, Rejoin()), (turned, HOW)):
+        tracks = gaps.tracked(frames, GENERIC, how)
+        rows = tracklets(tracks, GENERIC.labels)
+        found.append(gaps.judge(rows, gaps.decided(tracks, rows), gaps.owners(tracks, recording.source)).counts(0.0))
+    (plain, *_), (right, wrong, _) = found
+    assert right >= 0.97 * plain > 20
+    assert wrong <= 1
+    counts = appearance_of(last(turned).density).counts[0, 2]
+    assert 20 <= counts.sum() <= right
+    assert counts[: DISTANCES // 3].sum() < 0.2 * counts.sum()
 
 
 def test_vectors_join_what_motion_does_not() -> None:

@@ -101,10 +101,25 @@ def test_what_is_lost_or_begins_in_an_exit_is_not_joined(exit_: Any) -> None:
 @pytest.mark.parametrize(("s", "expected"), [((2.0, 8.0), 1), ((6.0, 8.0), 2)])
 def test_a_passage_joins_its_ends(s: tuple[float, float], expected: int) -> None:
     """A car that is seen again at its other end, within the time, is the same object; without it that is new."""
-    frames = gaps.cars((0, 3, (0, 0), (8, 0)), (8, 10, (20, 90), (0, -8)))
-    way = Passage(box(18, -3, 30, 3), box(15, 20, 25, 32), s)
+    frames = gaps.cars((0, 3, (0, 0), (8, 0)), (8, 10, (20, 104), (0, -8)))
+    way = Passage(box(18, -3, 30, 3), box(15, 34, 25, 46), s)
     assert last_objects(frames, Rejoin(passages=(way,))) == [expected]
     assert last_objects(frames, Rejoin()) == [2]
+
+
+def test_passages_are_learned() -> None:
+    """In a corridor with a dead zone hardly anybody is joined at first, and many are after some minutes."""
+    recording = gaps.record("corridor", 22, 400.0)
+    tracks = gaps.tracked(recording.frames, GENERIC, Rejoin())
+    found = tracklets(tracks, GENERIC.labels)
+    before, after, probability = gaps.decided(tracks, found)
+    late = found.first_ns[after] > 200 * 10**9
+    owner = gaps.owners(tracks, recording.source)
+    judged = gaps.judge(found, (before[late], after[late], probability[late]), owner)
+    right, wrong, _ = judged.counts(0.0)
+    assert right >= 10
+    assert wrong == 0
+    assert (~late).sum() < right
 
 
 @pytest.fixture(scope="module", params=["street", "square"])
