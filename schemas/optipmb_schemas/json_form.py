@@ -67,7 +67,7 @@ class EdgeTrack(Struct, frozen=True, rename={"kind": "class"}):
     age_s: Annotated[float, Meta(description="Seconds since its first detection.")] | UnsetType = UNSET
     seen_s: Annotated[float, Meta(description="Seconds since its last detection.")] | UnsetType = UNSET
     object: (
-        Annotated[int, Meta(description="Id of the first track of its object; -1: not decided. Absent: not joined.")]
+        Annotated[int, Meta(description="Id of the first track of its object. Absent: not decided, or not joined.")]
         | UnsetType
     ) = UNSET
     object_probability: (
@@ -258,8 +258,12 @@ def _objects(tracks: Tracks, rows: NDArray[np.int64]) -> dict[str, Iterable[Any]
     """Return the fields of the objects of rows."""
     if tracks.object is None or tracks.object_probability is None:
         return dict.fromkeys(("object", "object_probability"), repeat(UNSET))
+    number = tracks.object[rows]
     probability = np.round(tracks.object_probability[rows].astype(np.float64), DIGITS)
-    return {"object": tracks.object[rows].tolist(), "object_probability": probability.tolist()}
+    known = zip(number.tolist(), probability.tolist(), strict=True)
+    # A reader that counts by `object` would take all tracks with one mark for one object.
+    told = [(one, share) if one >= 0 else (UNSET, UNSET) for one, share in known]
+    return {"object": [one for one, _ in told], "object_probability": [share for _, share in told]}
 
 
 def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place | None = None) -> bytes:

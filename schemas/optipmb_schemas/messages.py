@@ -333,7 +333,7 @@ class Tracks(ResultMessage):
     object: Annotated[Integers, Array("i8", ("N",), -1, INT64)] | None = Field(
         default=None,
         description="Id of the first track of the object, which may have had others before. Equal to `id`: a new "
-        "object. -1: not decided. Absent, as is the next: the session does not join tracks over gaps.",
+        "object. -1: not decided; who counts objects leaves it out. Absent, as is the next: tracks are not joined.",
     )
     object_probability: Annotated[Singles, Array("f4", ("N",), 0, 1)] | None = Field(
         default=None, description="That all joins of the object are right: their product. 1 without a join."

@@ -1,5 +1,6 @@
 """Tracks joined over gaps: scores and matching against oracles, what columns hold, and the commands."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -306,10 +307,27 @@ def test_a_table_says_which_tracks_are_one_object(
     assert switches == [1, 0]
 
 
+def test_results_may_have_objects_as_ids(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With `--ids object` the car has one id in a table and in OpenLABEL, and the command says how many objects are."""
+    words = ("track", table, "--rejoin", "30", "--min-probability", "0.9", "--ids", "object")
+    done = run_here(capsys, *words, "--out", tmp_path / "tracks.csv")
+    assert "3 confirmed tracks are 2 objects" in done.stdout + done.stderr
+    columns = read_table(tmp_path / "tracks.csv", {})
+    assert "object" not in columns
+    for frame in np.unique(columns["frame"]).tolist():
+        identity = columns["id"][columns["frame"] == frame]
+        assert np.diff(identity).min(initial=1) > 0
+    assert len(set(columns["id"][columns["confirmed"] > 0].tolist())) == 2
+    assert run_here(capsys, *words, "--out", tmp_path / "t.openlabel.json").returncode == 0
+    objects = json.loads((tmp_path / "t.openlabel.json").read_text())["openlabel"]["objects"]
+    assert len(objects) == 2
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (("track", "{table}", "--rejoin", "--out", "{out}"), "--rejoin: expected a table as --out"),
+        (("track", "{table}", "--rejoin", "--out", "{out}"), "--rejoin: expected --ids object or a table as --out"),
+        (("track", "{table}", "--ids", "object", "--out", "{out}.csv"), "expected track, or object with --rejoin"),
         (("track", "{table}", "--rejoin", "0", "--out", "{out}.csv"), "expected a time in (0, 600] s, received 0"),
         (("track", "{table}", "--rejoin", "601", "--out", "{out}.csv"), "received 601"),
         (

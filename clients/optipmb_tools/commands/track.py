@@ -95,6 +95,10 @@ class TrackOptions:
     min_probability: Annotated[
         float | None, typer.Option(help="With --rejoin: least probability of a join; default 0.98.", show_default=False)
     ] = None
+    ids: Annotated[
+        str,
+        typer.Option(metavar="track|object", help="With --rejoin, object: ids are those of objects, in any format."),
+    ] = "track"
     keep_input: Annotated[
         bool, typer.Option("--keep-input", help="Of a bag, with --out FILE.mcap: also copy what is in it.")
     ] = False
@@ -119,16 +123,22 @@ class TrackOptions:
 
         return RejoinOptions(self.rejoin, *() if self.min_probability is None else (self.min_probability,))
 
+    def _check_joining(self) -> None:
+        out = self.out
+        if self.ids not in {"track", "object"} or (self.ids == "object" and self.rejoin is None):
+            raise UsageError(f"--ids {self.ids}: expected track, or object with --rejoin")
+        if self.rejoin is not None and self.ids == "track" and (not is_table(out) or out.is_dir()):
+            raise UsageError(f"--rejoin: expected --ids object or a table as --out, such as tracks.csv, received {out}")
+        if self.rejoin is None and self.min_probability is not None:
+            raise UsageError(f"--min-probability {self.min_probability:g}: expected --rejoin")
+
     def check_out(self, data: Data) -> None:
         """Refuse a file where the results are several; a bag of tracks holds one topic of a bag."""
         out = self.out
         check_export(out, data.dataset, len(data.sequences))
         if self.full and is_features(out):
             raise UsageError(f"--full: expected a folder, a table or OpenLABEL as --out, received {out}")
-        if self.rejoin is not None and (not is_table(out) or out.is_dir()):
-            raise UsageError(f"--rejoin: expected a table as --out, such as tracks.csv, received {out}")
-        if self.rejoin is None and self.min_probability is not None:
-            raise UsageError(f"--min-probability {self.min_probability:g}: expected --rejoin")
+        self._check_joining()
         if self.sensors is not None and not self.fuse:
             raise UsageError(f"--sensors {self.sensors}: expected --fuse, for one sensor has --profile alone")
         if self.view is not None and (self.view.suffix != ".html" or len(data.sequences) > 1):
@@ -201,6 +211,7 @@ def track(
                     show=how.show,
                     sensors=sensors,
                     rejoin=rejoin,
+                    ids=how.ids,
                     view=how.view,
                 ),
                 executor=executor,
@@ -242,6 +253,8 @@ def _say_result(result: "TrackedSequence") -> None:
     rate = result.frames / max(result.seconds, 1e-9)
     step = f", step p50 {result.step.p50_ms:.2f} ms p99 {result.step.p99_ms:.2f} ms" if result.step else ""
     say(f"{result.name}: {result.frames} frames, {result.tracks} tracks, {rate:.0f} frames/s{step}")
+    if result.joined is not None:
+        say(f"{result.name}: {result.joined[0]} confirmed tracks are {result.joined[1]} objects")
     if result.learned:
         say(f"{result.name}: learned {'; '.join(result.learned)}")
 

@@ -15,9 +15,10 @@ seconds, radians; in text with the decimals of `DECIMALS`. The same tracks alway
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from optipmb_schemas import Tracks
 from optipmb_schemas.json_form import shown
 
@@ -138,10 +139,19 @@ class Objects:
         number[known], probability[known] = self.object[place[known]], self.probability[place[known]]
         return {"object": number, "object_probability": probability}
 
+    def as_ids(self, tracks: Tracks) -> Tracks:
+        """Return the tracks of a frame with their objects as ids, without those that a later track has replaced."""
+        number = self.columns(tracks.id, np.full(len(tracks.id), tracks.stamp_ns))["object"]
+        replaced = (number < 0) & np.isin(tracks.id, self.id)
+        identity = np.where(number < 0, tracks.id, number)
+        order = np.argsort(identity, kind="stable")
+        found = taken(tracks, order[~replaced[order]])
+        return found.model_copy(update={"id": identity[order[~replaced[order]]]})
 
-def _shown(tracks: Tracks) -> Tracks:
-    """Return the tracks of a message that are shown."""
-    rows, of_tracks = shown(tracks), Tracks.arrays["id"].rows
+
+def taken(tracks: Tracks, rows: NDArray[Any]) -> Tracks:
+    """Return rows of the tracks of a message."""
+    of_tracks = Tracks.arrays["id"].rows
     columns = {name: getattr(tracks, name) for name, array in Tracks.arrays.items() if array.rows == of_tracks}
     return tracks.model_copy(update={name: one[rows] for name, one in columns.items() if one is not None})
 
@@ -229,7 +239,9 @@ class Results:
             return track_columns(sequence.name, tracks, sequence, full=self._full, georeference=place, objects=objects)
         path = self._dataset.write(self._out, sequence, tracks)
         if path.suffix in _RANKED and not self._submission:
-            self._dataset.write(self._out / SHOWN, sequence, {index: _shown(one) for index, one in tracks.items()})
+            self._dataset.write(
+                self._out / SHOWN, sequence, {index: taken(one, shown(one)) for index, one in tracks.items()}
+            )
         if self._full:
             write_full(full_path(path), tracks)
         else:

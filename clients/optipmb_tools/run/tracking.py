@@ -223,6 +223,7 @@ class TrackedSequence:
     unconfirmed_rows: int
     learned: tuple[str, ...]  # noise of the detections of each class, in words
     doubts: tuple[str, ...]  # velocities that contradict the motion of their boxes, in words
+    joined: tuple[int, int] | None  # confirmed tracks and their objects; None: they are not joined over gaps
     seconds: float
     step: Latency | None  # durations of the tracker's steps
 
@@ -240,6 +241,7 @@ class Tracking:
     show: float | None = None  # existence from which tracks are confirmed; None: as the profile says
     sensors: Sensors = ALIKE  # how frames that name their sensor are used
     rejoin: "RejoinOptions | None" = None  # join tracks over gaps (`optipmb_tools.run.rejoining`)
+    ids: str = "track"  # what ids are in the results: of the track, or of its object (`object`)
     view: Path | None = None  # page of the tracks, of one sequence
 
 
@@ -301,6 +303,10 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
         raise UsageError(f"--rejoin: sequence {name}: {expected}; here the motion of the sensor is estimated")
     found = replace(found, tracks=decided(found, how))
     objects = None if how.rejoin is None else how.rejoin.objects(found.tracks, how.parameters)
+    joined = None if objects is None else (len(objects.id), len(np.unique(objects.object)))
+    if objects is not None and how.ids == "object":
+        found = replace(found, tracks={index: objects.as_ids(one) for index, one in found.tracks.items()})
+        objects = None
     written = Results(dataset, job.out, full=how.full).write(sequence, found.tracks, objects)
     if how.view is not None:
         from optipmb_tools.views.page import write_page  # noqa: PLC0415  only where it is asked for
@@ -324,6 +330,7 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
         *TrackCounts.of(found.tracks.values()),
         found.learned,
         tuple(f"velocity: expected {EXPECTED}, received {one}" for one in found.doubts),
+        joined,
         found.seconds,
         latency(found.steps_ns),
     ), written

@@ -59,6 +59,7 @@ class SensorChecks:
         self._stamps = StampCheck()
         self._poses = PoseCheck()
         self._is_blind = False
+        self._is_ignored = False
         self._velocities = VelocityCheck()
         self._sizes = SizeCheck()
 
@@ -83,6 +84,11 @@ class SensorChecks:
         if policy.needs_view and message.field_of_view is None and not self._is_blind:
             self._is_blind = True
             findings.append(CheckFinding("no_view", "field_of_view", "where the sensor sees", "nothing"))
+        compared = policy.rejoin.embedding_model if policy.rejoin is not None else None
+        if compared is not None and message.embedding_model not in {None, compared} and not self._is_ignored:
+            self._is_ignored = True
+            found = f"{message.embedding_model!r}: the vectors are ignored"
+            findings.append(CheckFinding("embedding", "embedding_model", f"{compared!r}, as of `rejoin`", found))
         if message.size is not None and self._sizes.add(frame):
             findings.append(CheckFinding("size", "size", SIZES, self._sizes.contradiction))
         if message.velocity is not None and self._velocities.add(frame, estimated=estimated):

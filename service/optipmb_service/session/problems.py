@@ -33,6 +33,10 @@ CODES: Final = {
         "The sensor moves, and its frames have no pose: the motion is estimated; reported once per session.",
         "Send poses where they are known: tracks are in the axes of the sensor without them.",
     ),
+    "embedding": (
+        "Vectors are of another model than `embedding_model` of `rejoin`; reported once per session and sensor.",
+        "Send vectors of that model, or set the one that is sent; until then motion alone joins.",
+    ),
     "far": (
         "Tracks are far from the origin of their site in `sites`, so their latitudes are wrong; reported once.",
         "Send metres from that origin, not coordinates of a grid, such as UTM; or correct `origin`.",
