@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from optipmb.model.parameters import Parameters
     from optipmb.model.rows import Array, Index
     from optipmb.model.tracks import Tracks
-    from optipmb.tracker import Modules
+    from optipmb.tracker import Modules, StepResult
 
 
 FLAT: Final = (("center", ("x", "y", "z")), ("size", ("l", "w", "h")), ("velocity", ("vx", "vy")))
@@ -412,20 +412,8 @@ class OnlineTracker:
             stamp_ns = _stamp(t)
             if not max(self.density.stamp_ns, 0) <= stamp_ns < 2**63:
                 raise FrameError("t", f"a time from {max(self.density.stamp_ns, 0) / 1e9:g} s on, in seconds", str(t))
-        if forms_of(boxes):
-            arrays = {**from_detector(boxes, camera=camera), **arrays}
-            boxes = None
-            arrays.pop("camera", None)
-        row, outside = None, 0
-        if camera is None:
-            columns = _columns(boxes, arrays)
-        else:
-            pixels = _pixels(boxes, arrays)
-            looks = pixels.pop("embedding", None)
-            columns = self._on_ground(camera, pose, pixels)
-            if looks is not None:
-                columns["embedding"] = np.asarray(looks)[columns["row"]]
-            row, outside = columns.pop("row"), sum(columns.pop("left_out").values())
+        columns, row, outside = self._given(boxes, arrays, camera, pose)
+        if camera is not None:
             field_of_view = field_of_view or camera.view_from(pose)
         compared = None if self._rejoin is None else self._rejoin.embedding_model
         if "embedding" in columns and embedding_model != compared:
@@ -448,14 +436,20 @@ class OnlineTracker:
         self._doubt(frame)
         result = self._tracker.step(self.density, frame)
         self.density = result.density
+        online = self._shown(frame, result, max(left_out, missing) + outside)
+        self._latest = online.summary
+        return online
+
+    def _shown(self, frame: Frame, result: StepResult, left_out: int) -> OnlineTracks:
+        """Return the tracks of a step; a velocity is NaN until a track was detected twice, or its detector gave one."""
         tracks = result.tracks
         once = (tracks.age == tracks.time_since_detection) & (tracks.velocity == 0.0).all(axis=1)
         known = dict(tracks.columns()) | {"velocity": np.where(once[:, None], np.nan, tracks.velocity)}
-        online = OnlineTracks(
+        return OnlineTracks(
             stamp_ns=frame.stamp_ns,
             tracks=tracks,
             name=self._names[tracks.label].astype(np.str_),
-            left_out=max(left_out, missing) + outside,
+            left_out=left_out,
             **known,
             paths=result.paths,
             class_probability=result.class_probability,
@@ -464,8 +458,24 @@ class OnlineTracker:
             object=None if result.joined is None else result.joined.object,
             object_probability=None if result.joined is None else result.joined.probability,
         )
-        self._latest = online.summary
-        return online
+
+    def _given(
+        self, boxes: Any, arrays: dict[str, Any], camera: GroundCamera | None, pose: Pose | None
+    ) -> tuple[dict[str, Any], Index | None, int]:
+        """Return the columns of detections; of pixel boxes also their rows, and how many boxes have no place."""
+        if forms_of(boxes):
+            arrays = {**from_detector(boxes, camera=camera), **arrays}
+            boxes = None
+            arrays.pop("camera", None)
+        if camera is None:
+            return _columns(boxes, arrays), None, 0
+        pixels = _pixels(boxes, arrays)
+        looks = pixels.pop("embedding", None)
+        columns = self._on_ground(camera, pose, pixels)
+        row, outside = columns.pop("row"), sum(columns.pop("left_out").values())
+        if looks is not None:
+            columns["embedding"] = np.asarray(looks)[row]
+        return columns, row, outside
 
     def _doubt(self, frame: Frame) -> None:
         """Warn of a frame whose numbers have another meaning than they should, by all appearance."""
