@@ -205,6 +205,13 @@ class SessionSummary(Message):
         max_length=256,
         description="Noise of the detections of each class that the session has learned, in words.",
     )
+    rejoined: Count | None = Field(
+        default=None,
+        description="Tracks joined with an earlier one of the same object. Absent, as the next three: none.",
+    )
+    lost_objects: Count | None = Field(default=None, description="Lost objects that may still be joined.")
+    lost_dropped: Count | None = Field(default=None, description="Lost objects dropped because there were too many.")
+    embedding_ignored: Count | None = Field(default=None, description="Frames whose embeddings were ignored.")
 
 
 class MemberSummary(Message):

@@ -10,7 +10,7 @@ import pytest
 from fake_service import Behaviour, FakeService
 from optipmb_client import Connection
 from optipmb_client.sessions import find_services
-from optipmb_schemas import Keys, MemberSummary, Problem, ServiceStatus, encoding_of
+from optipmb_schemas import Keys, MemberSummary, Problem, ServiceStatus, SessionSummary, encoding_of
 from optipmb_tools.cli import run
 from optipmb_tools.views.terminal import members_of, status_tables
 from rich.console import Console
@@ -127,3 +127,17 @@ def test_text_from_the_network_is_never_markup() -> None:
     with console.capture() as capture:
         console.print(status_tables([status]))
     assert f"{text} (3 times)" in capture.get()
+
+
+def test_joining_is_told_where_it_happens() -> None:
+    """A stream that joins tracks has a line with what was joined, lost and ignored; another has none."""
+    sessions = tuple(
+        SessionSummary(stream=f"a/b/{name}", profile="generic", state="running", **counts)
+        for name, counts in (("c", {"rejoined": 3, "lost_objects": 2, "embedding_ignored": 7}), ("d", {}))
+    )
+    status = ServiceStatus(instance="x", version="1", started_ns=0, uptime_s=1.0, state="ready", sessions=sessions)
+    console = Console(width=200)
+    with console.capture() as capture:
+        console.print(status_tables([status]))
+    lines = [line.strip() for line in capture.get().splitlines() if "joined" in line]
+    assert lines == ["a/b/c: 3 tracks joined over gaps, 2 lost objects, 7 frames with ignored embeddings"]

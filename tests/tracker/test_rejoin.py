@@ -8,9 +8,12 @@ import gaps
 import numpy as np
 import pytest
 from optipmb_tools.run.rejoining import tracklets
+from scipy.stats import lognorm
 
 import optipmb
 from optipmb import OnlineTracker, ParameterError, Passage, Rejoin, Relocation, Tracker, generic_parameters
+from optipmb.joining import rejoin
+from optipmb.model.lost_objects import Returns, Tracklets
 
 GENERIC = generic_parameters(gaps.CLASSES, 0.1)
 HIDDEN = gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0)))
@@ -105,6 +108,35 @@ def test_a_passage_joins_its_ends(s: tuple[float, float], expected: int) -> None
     way = Passage(box(18, -3, 30, 3), box(15, 34, 25, 46), s)
     assert last_objects(frames, Rejoin(passages=(way,))) == [expected]
     assert last_objects(frames, Rejoin()) == [2]
+
+
+def test_learned_scores_are_a_mixture_of_returns() -> None:
+    """Place, time in proportion to the speed and weight of each return count as in plain numpy; others do not."""
+    chance, count = np.random.default_rng(3), 5
+    tracks = Tracklets.of(np.zeros(2 * Tracklets.width))
+    tracks.id[:], tracks.first_ns[:], tracks.last_ns[:] = (1, 9), (0, 20 * 10**9), (10**9, 30 * 10**9)
+    tracks.begin[1], tracks.end_velocity[0], tracks.begin_velocity[1] = (20.0, 1.0), (1.1, 0.0), (0.9, 0.1)
+    tracks.end_variance[:], tracks.begin_variance[:] = 0.01, 0.02
+    returns = Returns.of(np.zeros(count * Returns.width))
+    returns.id[:], returns.kind[:] = (2, 3, 4, 5, 9), (0, 0, 0, 1, 0)
+    returns.start[:], returns.end[:] = chance.normal(0.0, 2.0, (2, count, 2))
+    returns.end[:, 0] += 20.0
+    returns.seconds[:], returns.speed[:], returns.weight[:] = (15, 22, 19, 19, 19), 1.2, (0.3, 0.9, 0.6, 1.0, 1.0)
+    returns.speed[2] = np.nan
+    score, share = rejoin.learned_score(tracks, 0, tracks, 1, 0, returns)
+    speeds, variances = np.array((1.1, np.hypot(0.9, 0.1))), np.array((0.01, 0.02))
+    weights = 1.0 / (variances + (rejoin.PACE * speeds) ** 2)
+    speed = (weights * speeds).sum() / weights.sum()
+    deviation = np.hypot(1.0 / np.sqrt(weights.sum()) / speed, rejoin.PACE)
+    near = returns.weight[:3] * np.exp(-0.5 * (returns.start[:3] ** 2).sum(axis=1) / 9.0)
+    square = ((returns.end[:3] - tracks.begin[1]) ** 2).sum(axis=1)
+    median = returns.seconds[:3] * np.array((1.2 / speed, 1.2 / speed, 1.0))
+    spread = np.array((deviation, deviation, 2.0 * rejoin.PACE))
+    density = lognorm.pdf(19.0, spread, scale=median) * np.exp(-0.5 * square / 9.0) / (18.0 * np.pi)
+    assert share == pytest.approx(rejoin.LEARNED * near.sum() / (near.sum() + rejoin.FIRST_RETURNS))
+    assert score == pytest.approx(np.log(0.5 * share * (near * density).sum() / near.sum()))
+    tracks.begin[1] = 3.0, 4.0
+    assert rejoin.learned_score(tracks, 0, tracks, 1, 0, returns) == (-np.inf, 0.0)
 
 
 def test_passages_are_learned() -> None:

@@ -18,12 +18,7 @@ from rich.text import Text
 
 COLUMNS = ("stream", "profile", "state", "frames/s", "p50 ms", "p99 ms", "frames", "tracks", "queue")
 COUNTED = ("refused", "shed", "late", "gaps", "duplicates", "last frame")
-JOINING = (
-    ("rejoined", "tracks joined over gaps"),
-    ("lost_objects", "lost objects"),
-    ("lost_dropped", "lost objects dropped"),
-    ("embedding_ignored", "frames with ignored embeddings"),
-)
+JOINING = ("tracks joined over gaps", "lost objects", "lost objects dropped", "frames with ignored embeddings")
 TEXTS = 3  # columns of texts; the others are of numbers
 LISTED_PROBLEMS = 5
 WORKER = re.compile(r"-w\d+$")  # follows the instance in the name of one of its workers
@@ -56,7 +51,8 @@ def status_tables(services: Sequence[ServiceStatus]) -> Group:
         shown.append(_streams(service.sessions) if service.sessions else Text("no streams"))
         for each in service.sessions:
             shown += [Text(f"{each.stream}: learned {'; '.join(each.learned)}")] if each.learned else []
-            joining = [f"{count} {text}" for name, text in JOINING if (count := getattr(each, name)) is not None]
+            known = each.rejoined, each.lost_objects, each.lost_dropped, each.embedding_ignored
+            joining = [f"{count} {text}" for count, text in zip(known, JOINING, strict=True) if count]
             shown += [Text(f"{each.stream}: {', '.join(joining)}")] if joining else []
         for one in service.problems[-LISTED_PROBLEMS:]:
             text = f"problem: {one.stream or 'no stream'}: {one.message}{_times(one)}"

@@ -436,7 +436,7 @@ class SessionParameters(_message.Message):
     def __init__(self, profile: _Optional[str] = ..., cloud_wait_s: _Optional[float] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., restart: _Optional[bool] = ..., values: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., sensors: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., session: _Optional[str] = ...) -> None: ...
 
 class SessionSummary(_message.Message):
-    __slots__ = ("stream", "profile", "state", "rate_hz", "latency_p50_ms", "latency_p99_ms", "frames", "refused", "shed", "gaps", "tracks", "queue", "age_s", "worker", "sensors", "silent", "late", "duplicates", "configured", "learned")
+    __slots__ = ("stream", "profile", "state", "rate_hz", "latency_p50_ms", "latency_p99_ms", "frames", "refused", "shed", "gaps", "tracks", "queue", "age_s", "worker", "sensors", "silent", "late", "duplicates", "configured", "learned", "rejoined", "lost_objects", "lost_dropped", "embedding_ignored")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     PROFILE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -457,6 +457,10 @@ class SessionSummary(_message.Message):
     DUPLICATES_FIELD_NUMBER: _ClassVar[int]
     CONFIGURED_FIELD_NUMBER: _ClassVar[int]
     LEARNED_FIELD_NUMBER: _ClassVar[int]
+    REJOINED_FIELD_NUMBER: _ClassVar[int]
+    LOST_OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    LOST_DROPPED_FIELD_NUMBER: _ClassVar[int]
+    EMBEDDING_IGNORED_FIELD_NUMBER: _ClassVar[int]
     stream: str
     profile: str
     state: str
@@ -477,7 +481,11 @@ class SessionSummary(_message.Message):
     duplicates: int
     configured: str
     learned: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, stream: _Optional[str] = ..., profile: _Optional[str] = ..., state: _Optional[str] = ..., rate_hz: _Optional[float] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., frames: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., tracks: _Optional[int] = ..., queue: _Optional[int] = ..., age_s: _Optional[float] = ..., worker: _Optional[int] = ..., sensors: _Optional[_Iterable[str]] = ..., silent: _Optional[_Iterable[str]] = ..., late: _Optional[int] = ..., duplicates: _Optional[int] = ..., configured: _Optional[str] = ..., learned: _Optional[_Iterable[str]] = ...) -> None: ...
+    rejoined: int
+    lost_objects: int
+    lost_dropped: int
+    embedding_ignored: int
+    def __init__(self, stream: _Optional[str] = ..., profile: _Optional[str] = ..., state: _Optional[str] = ..., rate_hz: _Optional[float] = ..., latency_p50_ms: _Optional[float] = ..., latency_p99_ms: _Optional[float] = ..., frames: _Optional[int] = ..., refused: _Optional[int] = ..., shed: _Optional[int] = ..., gaps: _Optional[int] = ..., tracks: _Optional[int] = ..., queue: _Optional[int] = ..., age_s: _Optional[float] = ..., worker: _Optional[int] = ..., sensors: _Optional[_Iterable[str]] = ..., silent: _Optional[_Iterable[str]] = ..., late: _Optional[int] = ..., duplicates: _Optional[int] = ..., configured: _Optional[str] = ..., learned: _Optional[_Iterable[str]] = ..., rejoined: _Optional[int] = ..., lost_objects: _Optional[int] = ..., lost_dropped: _Optional[int] = ..., embedding_ignored: _Optional[int] = ...) -> None: ...
 
 class TrackRequest(_message.Message):
     __slots__ = ("detections", "points", "traceparent")

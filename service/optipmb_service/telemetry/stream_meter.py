@@ -90,4 +90,8 @@ class StreamMeter:
             tracks=state.tracks,
             queue=state.queue,
             age_s=self.age_s(now_ns),
+            rejoined=state.rejoined,
+            lost_objects=state.lost_objects,
+            lost_dropped=state.lost_dropped,
+            embedding_ignored=state.embedding_ignored,
         )

@@ -21,7 +21,7 @@ from optipmb_service.session.session import Session
 from optipmb_service.settings import MOST_ZONES, RejoinSettings
 from sessions import Merged, plain, problems, tracks
 
-from optipmb import OnlineTracker, Rejoin, generic_parameters
+from optipmb import OnlineTracker, Passage, Rejoin, generic_parameters
 from optipmb.online import KNOWN
 from optipmb.world import zones
 from optipmb.world.zones import Event, Zone
@@ -35,6 +35,11 @@ STREAM = "site/node/camera"
 
 
 MODEL = replace(HOW, embedding_model="reid-7")
+DECLARED = replace(
+    HOW,
+    exits=(((-60, 5), (-30, 5), (-30, 25), (-60, 25)),),
+    passages=(Passage(((-24, 5), (-14, 5), (-14, 15), (-24, 15)), ((-12, 5), (0, 5), (0, 15), (-12, 15)), (0.5, 9)),),
+)
 VECTORS = gaps.with_vectors(RECORDING, 0.85)
 YARD = Zone("yard", polygon=((-5, -5), (200, -5), (200, 5), (-5, 5)), dwell_s=(6.0,), lost_s=6.0)
 SHORT = Zone("short", polygon=((-5, -5), (200, -5), (200, 5), (-5, 5)))
@@ -58,8 +63,13 @@ def in_order(policy: Policy = POLICY, messages: list[Detections] = MESSAGES) -> 
 
 @pytest.mark.parametrize(
     ("given", "policy"),
-    [(FRAMES, POLICY), (FRAMES, Policy(zones=(YARD, SHORT, GATE), rejoin=HOW)), (VECTORS, Policy(rejoin=MODEL))],
-    ids=["motion", "zones", "vectors"],
+    [
+        (FRAMES, POLICY),
+        (FRAMES, Policy(zones=(YARD, SHORT, GATE), rejoin=HOW)),
+        (VECTORS, Policy(rejoin=MODEL)),
+        (FRAMES, Policy(rejoin=DECLARED)),
+    ],
+    ids=["motion", "zones", "vectors", "exits and passages"],
 )
 def test_a_session_joins_as_the_library_does(given: list[dict[str, Any]], policy: Policy) -> None:
     """Tracks, objects and probabilities are those of `OnlineTracker`, for any order of frames and any restores."""
