@@ -123,7 +123,8 @@ def test_learned_scores_are_a_mixture_of_returns() -> None:
     returns.end[:, 0] += 20.0
     returns.seconds[:], returns.speed[:], returns.weight[:] = (15, 22, 19, 19, 19), 1.2, (0.3, 0.9, 0.6, 1.0, 1.0)
     returns.speed[2] = np.nan
-    score, share = rejoin.learned_score(tracks, 0, tracks, 1, 0, returns)
+    one, others = rejoin.tracklets_in(tracks.words), rejoin.returns_in(returns.words)
+    score, share = rejoin.learned_score(one, 0, one, 1, 0, others)
     speeds, variances = np.array((1.1, np.hypot(0.9, 0.1))), np.array((0.01, 0.02))
     weights = 1.0 / (variances + (rejoin.PACE * speeds) ** 2)
     speed = (weights * speeds).sum() / weights.sum()
@@ -136,7 +137,7 @@ def test_learned_scores_are_a_mixture_of_returns() -> None:
     assert share == pytest.approx(rejoin.LEARNED * near.sum() / (near.sum() + rejoin.FIRST_RETURNS))
     assert score == pytest.approx(np.log(0.5 * share * (near * density).sum() / near.sum()))
     tracks.begin[1] = 3.0, 4.0
-    assert rejoin.learned_score(tracks, 0, tracks, 1, 0, returns) == (-np.inf, 0.0)
+    assert rejoin.learned_score(one, 0, one, 1, 0, others) == (-np.inf, 0.0)
 
 
 def test_passages_are_learned() -> None:
