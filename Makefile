@@ -110,7 +110,7 @@ accuracy: kernels
 
 # What measures memory, latency and outages, one test after the other.
 alone: kernels
-	$(BIN)/pytest $(JUNIT) $(LONG) tests/e2e tests/service/stream/test_memory.py -m alone
+	$(BIN)/pytest $(JUNIT) $(LONG) tests/e2e tests/service/stream/test_memory.py tests/service/cluster/test_leases.py -m alone
 
 # Compiling all kernels a second time takes a minute; what is compiled is kept in .pytest_cache.
 bounds: $(VENV)/.installed

@@ -14,7 +14,7 @@ from types import SimpleNamespace
 
 import pytest
 from optipmb_schemas import Keys, SessionState
-from optipmb_service.app.lifecycle import LAST_S, EndBound, Steps, StopRequest, longest_end_s, say_ready
+from optipmb_service.app.lifecycle import HANDOVER_S, LAST_S, EndBound, Steps, StopRequest, longest_end_s, say_ready
 from optipmb_service.app.workers import WORKERS_S
 from processes import descendants, wait_until_ended
 from router import Node, Sensor
@@ -26,8 +26,10 @@ NAMESPACE = ("unshare", "--pid", "--fork", "--kill-child")
 HANGING = Path(__file__).parents[2] / "support" / "hanging"
 SENSOR = Sensor()
 GRACE_S = 0.5
-BOUND_S = longest_end_s(GRACE_S)
-FROZEN_S = 4.0
+SHORT_S = 1.0
+"""For a handover, where a process is to hang."""
+BOUND_S = longest_end_s(GRACE_S) - HANDOVER_S + SHORT_S
+FROZEN_S = 3.0
 """So long that it is noticed, and shorter than the bound."""
 BUSY_S = 30.0
 """How much later a busy machine may notice that a process has ended."""
@@ -36,7 +38,7 @@ BUSY_S = 30.0
 def environment(hang: str = "", **settings: object) -> dict[str, str]:
     """Return variables for a process that is to hang at a place, or nowhere."""
     path = os.pathsep.join(filter(None, (str(HANGING), os.environ.get("PYTHONPATH"))))
-    hangs = {"PYTHONPATH": path, "HANG": hang} if hang else {}
+    hangs = {"PYTHONPATH": path, "HANG": hang, "HANDOVER_S": str(SHORT_S)} if hang else {}
     return hangs | {f"OPTIPMB_{name}": str(value) for name, value in ({"GRACE_S": GRACE_S} | settings).items()}
 
 

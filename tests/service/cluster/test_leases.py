@@ -496,6 +496,7 @@ def patiently(call: Callable[[], Any]) -> Any:
     return answers[-1]
 
 
+@pytest.mark.alone
 def test_of_three_servers_one_may_be_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each of three servers in turn is killed and comes back: the same members go on, under the same fences.
 

@@ -9,6 +9,7 @@ import pytest
 import structlog
 from nats_process import NatsProcess, NatsTrio, started
 from optipmb_service.app.cli import nats_server
+from optipmb_service.cluster import message_log
 from optipmb_service.cluster.message_log import ALONE_TRIES, OVERHEAD, LogMessage, LogWriter, MessageLog, Retention
 from optipmb_service.cluster.nats_connection import NatsRefusedError
 from router import until
@@ -20,6 +21,11 @@ KEEP = {"detections": Retention(60, 2**25)}
 
 def message(seq: int, size: int) -> LogMessage:
     return LogMessage("detections", "a/b/c", bytes(16), seq, seq, "", (0, 0), bytes(size), "")
+
+
+@pytest.fixture(autouse=True)
+def _short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(message_log, "RETRY_S", 0.05)
 
 
 @pytest.fixture

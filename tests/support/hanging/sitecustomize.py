@@ -1,8 +1,8 @@
 """What makes the end of a process hang: Python runs it at the start of a process that has this folder on its path.
 
 `HANG` says where: `close`, in closing the Zenoh session; `lock`, there too, with the interpreter's lock held;
-`leave`, in the first step of a member's end; `loop`, in its control loop, before the end. Workers inherit both
-variables from their parent.
+`leave`, in the first step of a member's end; `loop`, in its control loop, before the end. The end has less time for a
+handover, by `HANDOVER_S`. Workers inherit the variables from their parent.
 """
 
 import ctypes
@@ -11,7 +11,7 @@ import sys
 import time
 
 from optipmb_client.zenoh import session
-from optipmb_service.app import service
+from optipmb_service.app import lifecycle, service
 from optipmb_service.zenoh import transport
 
 LONG_S = 3600
@@ -32,6 +32,9 @@ def hang_with_the_lock(*_: object) -> None:
     """Wait in machine code that lets no other Python run."""
     ctypes.PyDLL(None).sleep(LONG_S)
 
+
+for module in (lifecycle, service):
+    module.HANDOVER_S = float(os.environ["HANDOVER_S"])  # type: ignore[misc]  # shorter than in production
 
 if os.environ["HANG"] == "leave":
     transport.Transport.leave = hang  # type: ignore[method-assign]  # it is to hang
