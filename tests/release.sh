@@ -17,7 +17,14 @@ rm -rf dist && mkdir -p out
 "$bin/python" -m build --wheel --outdir dist node
 make wheels DIST=dist
 "$bin/python" -m twine check --strict dist/*
-"$bin/python" -m cyclonedx_py requirements docker/requirements.lock --output-file out/sbom.cdx.json
+# What is in the image: a list with licences, and what is known against it. Packages that no database can be asked about are named.
+"$bin/python" -m venv --clear --without-pip out/image-env
+"$bin/python" -m pip --python out/image-env install --quiet --no-deps --require-hashes --requirement docker/requirements.lock
+"$bin/python" -m cyclonedx_py environment out/image-env --output-file out/sbom.cdx.json
+"$bin/python" packaging/licences.py out/sbom.cdx.json >out/licences.txt
+rm -rf out/audit
+"$bin/python" -m pip install --quiet --target out/audit "pip-audit>=2.9,<3"
+PYTHONPATH=out/audit "$bin/python" -m pip_audit --no-deps --disable-pip --requirement docker/requirements.lock
 echo "release: dist/ is ready. To publish $version:"
 echo "  git tag -a v$version -m 'OptiPMB $version' && git push origin v$version"
 echo "  $bin/python -m twine upload dist/*"

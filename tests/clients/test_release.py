@@ -63,8 +63,9 @@ def release(work: Path) -> "tuple[subprocess.CompletedProcess[str], list[str]]":
 
 
 def test_it_tests_builds_checks_and_stops_before_publishing(checkout: Path) -> None:
-    """All tests, wheels without and with machine code, their check; tag and upload are printed for a person to run."""
+    """All tests, all wheels, their check, what is in the image; tag and upload are printed for a person to run."""
     done, calls = release(checkout)
+    image = "docker/requirements.lock"
     assert done.returncode == 0, done.stderr
     assert calls[1:] == [
         "make test wheel accuracy alone",
@@ -72,7 +73,12 @@ def test_it_tests_builds_checks_and_stops_before_publishing(checkout: Path) -> N
         "python -m build --wheel --outdir dist node",
         "make wheels DIST=dist",
         "python -m twine check --strict dist/*",
-        "python -m cyclonedx_py requirements docker/requirements.lock --output-file out/sbom.cdx.json",
+        "python -m venv --clear --without-pip out/image-env",
+        f"python -m pip --python out/image-env install --quiet --no-deps --require-hashes --requirement {image}",
+        "python -m cyclonedx_py environment out/image-env --output-file out/sbom.cdx.json",
+        "python packaging/licences.py out/sbom.cdx.json",
+        "python -m pip install --quiet --target out/audit pip-audit>=2.9,<3",
+        f"python -m pip_audit --no-deps --disable-pip --requirement {image}",
     ]
     assert "git tag -a v9.9.9" in done.stdout
     assert "twine upload dist/*" in done.stdout

@@ -319,7 +319,7 @@ messages: dict[type[Message], st.SearchStrategy[Message]] = {
 
 
 @pytest.mark.parametrize("kind", MESSAGES)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(data=st.data())
 def test_every_message_comes_back_equal(kind: type[Message], data: st.DataObject) -> None:
     """Decoding gives an equal message with equal bytes, as msgpack and as JSON, with and without a named encoding."""
