@@ -21,6 +21,10 @@ from optipmb_service.settings import (
     FusedSettings,
     InputSettings,
     LimitSettings,
+    LinkFrame,
+    LinkPassage,
+    LinkRegion,
+    LinkSettings,
     MappingSettings,
     MqttInput,
     MqttSettings,
@@ -95,6 +99,7 @@ TASKS: Final = (
     ("output at a fixed rate, prediction to now", "`outputs`; see [Fixed rate](fixed-rate.md)"),
     ("the same object after a gap", "`rejoin`; see [Gaps](gaps.md)"),
     ("localisation, poses, jumps of the pose", "`max_speed`, `jumps`"),
+    ("one id for one object over streams and sites", "`links`; see [Links](links.md)"),
     ("clouds on one host", "`shared_memory`"),
 )
 """Settings by what somebody looks for; each setting is in one row at least."""
@@ -112,7 +117,7 @@ SETTINGS: Final = {
 EVENTS_OF: Final = {
     "Start and network": "log_lines_dropped",
     "Sessions and their state": "leases_gone",
-    "Leases and the message log": "partitions_held",
+    "Leases, links and the message log": "partitions_held",
     "Streams, traces and bridges": "traces_lost",
     "Workers": "worker_started",
     "End": "stop_asked",
@@ -123,6 +128,7 @@ METRICS_OF: Final = {
     "Sessions and streams": "sessions",
     "gRPC": "grpc_open_calls",
     "Senders of JSON": "inputs_frames_total",
+    "Links": "links_messages_total",
     "Message log, MQTT and certificates": "message_log_written_total",
 }
 """Sections of the long tables, each by its first row."""
@@ -162,6 +168,8 @@ def settings() -> str:
         *(("fused.NAME.", FusedSettings), ("sensors.PATTERN.", SensorSettings)),
         *(("zones.NAME.", ZoneSettings), ("outputs.PATTERN.", OutputSettings), ("rejoin.PATTERN.", RejoinSettings)),
         ("rejoin.PATTERN.passages.", PassageSettings),
+        *(("links.AREA.", LinkSettings), ("links.AREA.frames.SITE.", LinkFrame)),
+        *(("links.AREA.passages.", LinkPassage), ("links.AREA.exits.", LinkRegion)),
         *(("cpm.PATTERN.", CpmSettings), ("cpm.PATTERN.sensors.", CpmSensor)),
         *(("ros2.", Ros2Settings), ("ros2.streams.NAME.", Ros2Stream), ("mqtt.", MqttSettings)),
         *(("inputs.PATTERN.", InputSettings), ("mqtt.inputs.STREAM.", MqttInput)),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from optipmb_client.errors import ClientError, ConnectionFailed, ServiceRefused, ServiceUnavailable, UsageError
     from optipmb_client.publisher import Publisher
-    from optipmb_client.sessions import kept_tracks
+    from optipmb_client.sessions import kept_tracks, linked_objects
     from optipmb_client.subscriber import EventSubscriber, Missed, Received, Statistics, Subscriber
     from optipmb_client.zenoh import DEFAULT_ENDPOINT, Connection
 
@@ -30,13 +30,14 @@ __all__ = [
     "Subscriber",
     "UsageError",
     "kept_tracks",
+    "linked_objects",
 ]
 
 # Imported on first use: offline commands need no Zenoh.
 _MODULES = {
     "errors": ("ClientError", "ConnectionFailed", "ServiceRefused", "ServiceUnavailable", "UsageError"),
     "publisher": ("Publisher",),
-    "sessions": ("kept_tracks",),
+    "sessions": ("kept_tracks", "linked_objects"),
     "subscriber": ("EventSubscriber", "Missed", "Received", "Statistics", "Subscriber"),
     "zenoh": ("DEFAULT_ENDPOINT", "Connection"),
 }

@@ -9,6 +9,7 @@ from optipmb_schemas import (
     PREFIX,
     DrainRequest,
     Keys,
+    Links,
     Message,
     MessageError,
     MoveRequest,
@@ -34,6 +35,8 @@ __all__ = [
     "drain_service",
     "find_services",
     "kept_tracks",
+    "linked_objects",
+    "links_of",
     "move_stream",
     "only_service",
     "session_state",
@@ -89,6 +92,25 @@ def session_state(connection: Link, stream: str, *, prefix: str = PREFIX) -> Ses
         return _ask(connection, Keys(prefix).query(stream, "state"), SessionState)
     except ServiceRefused:
         return None
+
+
+def linked_objects(connection: Link, area: str, *, prefix: str = PREFIX) -> dict[tuple[str, str, int], bytes]:
+    """Return the common id of each linked object of an area, by stream, session and object or track.
+
+    Raises:
+        MessageError: The area is no name.
+        ServiceUnavailable: No `optipmb-service link` answers for the area.
+    """
+    found = links_of(connection, area, prefix=prefix)
+    return {(one.stream, one.session, one.object): one.global_id for one in found.objects}
+
+
+def links_of(connection: Link, area: str, *, prefix: str = PREFIX) -> Links:
+    """Return all linked objects of an area. Raises as `linked_objects` does."""
+    found = _ask(connection, Keys(prefix).links_query(area), Links)
+    if found is None:
+        raise ServiceUnavailable(f"no optipmb-service link answers for the area {area} (prefix {prefix})")
+    return found
 
 
 def kept_tracks(

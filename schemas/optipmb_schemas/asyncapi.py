@@ -25,6 +25,7 @@ _PARAMETERS: Final = {
     "site": "Site of a stream, not `owner` or `service`.",
     "node": "Node of a stream.",
     "sensor": "Sensor of a stream, or `fused`.",
+    "area": "Area of linked streams.",
     "instance": "Name of a service instance.",
 }
 _STREAM: Final = "site/node/sensor"
@@ -67,6 +68,10 @@ CHANNELS: Final = {
     "now": Channel("now", (_STREAM,), ("Tracks",), (), _AT_RATE, "send"),
     "events": Channel("events", (_STREAM,), ("Events",), (), f"Put by the service. {_CACHED}", "send"),
     "problems": Channel("problems", (_STREAM,), ("Problem",), (), "Put by the service.", "send"),
+    "links": Channel(
+        "links", ("area",), ("Links",), (), "Put by `optipmb-service link`; the whole every 10 s.", "send"
+    ),
+    "allLinks": Channel("links_query", ("area",), (QUERY,), ("Links",)),
     "state": _query("state", (QUERY,), "SessionState"),
     "density": _query("density", (QUERY,), "Density"),
     "keptTracks": _query("tracks", (QUERY, "TracksRequest"), "Tracks", "TracksRequest"),

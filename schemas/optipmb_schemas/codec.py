@@ -47,7 +47,7 @@ from optipmb_schemas.control import (
 )
 from optipmb_schemas.errors import MessageError, invalid, show
 from optipmb_schemas.limits import DEFAULT, Limits
-from optipmb_schemas.messages import Density, Detections, Events, FieldOfView, Points, Pose, Relocation, Tracks
+from optipmb_schemas.messages import Density, Detections, Events, FieldOfView, Links, Points, Pose, Relocation, Tracks
 from optipmb_schemas.model import Message
 
 T = TypeVar("T", bound=Message)
@@ -57,6 +57,7 @@ MESSAGES: Final[tuple[type[Message], ...]] = (
     Points,
     Tracks,
     Events,
+    Links,
     SessionState,
     Density,
     SessionParameters,

@@ -24,7 +24,17 @@ from optipmb_schemas.codec import MAJOR, MESSAGES, encoding_of
 from optipmb_schemas.control import MemberSummary, SessionState, SessionSummary
 from optipmb_schemas.errors import CODES
 from optipmb_schemas.limits import DEFAULT
-from optipmb_schemas.messages import Delivery, Detections, FieldOfView, Pose, Relocation, Tracks, ZoneCount, ZoneEvent
+from optipmb_schemas.messages import (
+    Delivery,
+    Detections,
+    FieldOfView,
+    LinkedObject,
+    Pose,
+    Relocation,
+    Tracks,
+    ZoneCount,
+    ZoneEvent,
+)
 from optipmb_schemas.model import Message
 
 SUFFIX = ".schema.json"
@@ -39,6 +49,7 @@ _KINDS: Final[tuple[type[Message], ...]] = (
     Delivery,
     ZoneEvent,
     ZoneCount,
+    LinkedObject,
     MemberSummary,
     SessionSummary,
 )

@@ -2,6 +2,8 @@
 
 <prefix>/<stream>/detections | points | tracks | now | events | problems     publications
 <prefix>/<stream>/q/state | q/density | q/tracks | q/zones | q/reset | q/parameters    queries
+<prefix>/links/<area>                                         publications: which objects of streams are one
+<prefix>/links/<area>/q/state                                 query
 <prefix>/owner/<stream>/<instance>                            liveliness: who tracks this stream
 <prefix>/service/<instance>/alive                             liveliness: which services are there
 <prefix>/service/<instance>/discovered/<run>/<streams>        liveliness: streams whose publishers say nothing
@@ -54,6 +56,14 @@ class Keys:
     def problems(self, stream: str) -> str:
         """Return the key of the problems with a stream."""
         return self._topic(stream, "problems")
+
+    def links(self, area: str) -> str:
+        """Return the key of the links of an area."""
+        return f"{self.prefix}/links/{_named('area', check_chunk, area)}"
+
+    def links_query(self, area: str) -> str:
+        """Return the key of the query for all links of an area."""
+        return f"{self.links(area)}/q/state"
 
     def query(self, stream: str, what: Query) -> str:
         """Return the key of a query about a stream."""

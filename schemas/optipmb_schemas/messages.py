@@ -486,6 +486,35 @@ class Events(ResultMessage):
                     raise invalid(f"zones[{at}].{name}", f"{classes} numbers, as many as `labels`", len(value))
 
 
+class LinkedObject(Message):
+    """An object of a session, and the id that it shares with objects of other sessions."""
+
+    global_id: Epoch = Field(
+        description="16 bytes (JSON: 32 hexadecimal digits): all objects with this id are one, in all streams."
+    )
+    stream: Stream = Field(description="Stream of the tracks.")
+    session: SessionId = Field(description="Session of the tracks.")
+    object: Count = Field(description="`object` of its tracks where that is known, else their `id`.")
+    probability: Annotated[float, Field(strict=True, ge=0, le=1)] = Field(description="That its link is right.")
+    kind: Literal["overlap", "passage", "appearance", "none"] = Field(
+        description="How it is linked: in views that overlap, over a time between two views, or by that and vectors of "
+        "appearance. `none`: its link was withdrawn, and no other object has this id."
+    )
+    ended: Flag = Field(description="Whether it is not tracked any more; its link stays.")
+
+
+class Links(Message):
+    """Which objects of several streams are one, put by `optipmb-service link`. Of an object the newest row holds."""
+
+    area: Name = Field(description="Name of the area in the settings.")
+    revision: Count = Field(description="Grows with every message of the area, through restarts.")
+    stamp_ns: Stamp = Field(description="Time up to which the tracks are linked, by their stamps.")
+    whole: Flag = Field(description="Whether these are all linked objects; else those that changed.")
+    objects: tuple[LinkedObject, ...] = Field(
+        default=(), max_length=100_000, fail_fast=True, description="Objects that are linked, or were."
+    )
+
+
 class Density(Message):
     """Reply of `q/density`: where the tracker expects objects that are not detected yet, one row per component.
 

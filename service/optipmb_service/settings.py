@@ -611,6 +611,88 @@ class RejoinSettings(BaseModel):
         return Rejoin(**values | {"passages": tuple(Passage(one.start, one.to, one.s) for one in self.passages)})
 
 
+class LinkRegion(BaseModel):
+    """Part of what streams see."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    streams: Pattern = "*/*/*"
+    """pattern of the streams"""
+    polygon: Shape = ()
+    """3 to 1000 corners, m, in the world frame of the stream; default: all that it sees"""
+
+    @field_validator("polygon")
+    @classmethod
+    def _check_polygon(cls, value: Shape) -> Shape:
+        if value:
+            ZoneSettings(streams=("*/*/*",), polygon=value)
+        return value
+
+
+def _region(value: Any) -> Any:
+    """Return the region that a pattern of streams or a polygon stands for."""
+    if isinstance(value, str):
+        return {"streams": value}
+    return {"polygon": value} if isinstance(value, list | tuple) else value
+
+
+Region = Annotated[LinkRegion, BeforeValidator(_region)]
+
+
+class LinkPassage(BaseModel):
+    """Way between two views that do not overlap."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    from_: Region = Field(alias="from")
+    """where objects leave: a pattern of streams, a polygon, or a table with `streams` and `polygon`"""
+    to: Region
+    """where they come in: as `from`"""
+    s: tuple[float, float]
+    """shortest and longest time between the two"""
+
+    @field_validator("s")
+    @classmethod
+    def _check_times(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not 0 <= value[0] < value[1]:
+            raise ValueError(f"a shortest time from 0 on and a longer one, received {list(value)}")
+        return value
+
+
+class LinkFrame(BaseModel):
+    """Place of the world frame of a site in the plane of an area."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    translation: tuple[float, float]
+    """x and y of its origin, m"""
+    yaw: float = 0.0
+    """direction of its x axis, rad"""
+
+
+class LinkSettings(BaseModel):
+    """An area whose streams `optipmb-service link` links: which of their objects are one."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    streams: Patterns
+    """patterns of the streams (as `garage/*/fused`), at most 64 streams"""
+    frames: dict[str, LinkFrame] = Field(default_factory=dict)
+    """places of the world frames of sites, by site; default: by `sites`, and where that says nothing, not known"""
+    passages: tuple[LinkPassage, ...] = Field(default=(), max_length=256)
+    """known ways between views; others are learned"""
+    exits: tuple[Region, ...] = Field(default=(), max_length=256)
+    """regions whose ends are final, and whose beginnings are new objects, as doors"""
+    min_probability: float = Field(default=0.97, ge=0.5, lt=1)
+    """least probability of a link"""
+    gap_s: float = Field(default=120.0, gt=0, le=600)
+    """longest time between two views"""
+    most: int = Field(default=10_000, ge=1, le=100_000)
+    """objects that are remembered; then the oldest that ended are forgotten"""
+    embedding_model: str = Field(default="", max_length=64)
+    """model whose vectors (`embedding` of Detections) are compared; default: none are, and no detections are read"""
+
+
 def _default_instance() -> str:
     """Return a name that two services do not share."""
     host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname()[:HOST_CHARACTERS]) or "host"
@@ -806,6 +888,8 @@ class Settings(BaseSettings):
     rejoin: dict[Pattern, RejoinSettings] = Field(default_factory=dict)
     """joining of tracks of the same object over gaps, by session pattern; the first match applies; equal on all members
     of a cluster"""
+    links: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]{1,64}$")], LinkSettings] = Field(default_factory=dict)
+    """areas whose streams `optipmb-service link` links, by name"""
     cpm: dict[Pattern, CpmSettings] = Field(default_factory=dict)
     """stations that send collective perception messages over MQTT and to ROS 2, by stream pattern, whose site is in
     `sites`; the first match applies"""

@@ -12,6 +12,8 @@ from optipmb_schemas import (
     DrainRequest,
     Events,
     FieldOfView,
+    LinkedObject,
+    Links,
     Message,
     MoveRequest,
     Points,
@@ -102,6 +104,16 @@ def _examples() -> list[Message]:
     left = ZoneEvent(zone="crossing", kind="left", how="lost", dwell_s=2.5, **where)
     crossed = ZoneEvent(zone="gate", kind="crossed", direction="left", **where)
     names = ("inside", "entered", "left", "appeared", "lost", "to_left", "to_right")
+    linked = LinkedObject(
+        global_id=bytes(range(16)),
+        stream=HEADER["stream"],
+        session="0123456789abcdef" * 2,
+        object=3,
+        probability=0.998,
+        kind="overlap",
+        ended=False,
+    )
+    links = Links(area="campus", revision=5, stamp_ns=6, whole=True, objects=(linked,))
     events = Events(
         **HEADER,
         session="0123456789abcdef" * 2,
@@ -170,6 +182,7 @@ def _examples() -> list[Message]:
         points,
         tracks,
         events,
+        links,
         state,
         density,
         parameters,
@@ -192,6 +205,8 @@ def example_of(examples: dict[str, Message]) -> Callable[[type[Message]], Messag
     tracks, status, events = examples["Tracks"], examples["ServiceStatus"], examples["Events"]
     assert isinstance(tracks, Tracks)
     assert isinstance(status, ServiceStatus)
+    links = examples["Links"]
+    assert isinstance(links, Links)
     assert isinstance(events, Events)
     assert tracks.delivery is not None
     assert events.zones is not None
@@ -203,6 +218,7 @@ def example_of(examples: dict[str, Message]) -> Callable[[type[Message]], Messag
         "SessionSummary": status.sessions[0],
         "ZoneEvent": events.events[0],
         "ZoneCount": events.zones[0],
+        "LinkedObject": links.objects[0],
     }
     return lambda kind: {**examples, **held}[kind.__name__]
 

@@ -10,7 +10,19 @@ import msgpack
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from optipmb_schemas import MESSAGES, Detections, Limits, Message, MessageError, Points, decode, encode, encode_json
+from optipmb_schemas import (
+    MESSAGES,
+    PATHS,
+    Detections,
+    Limits,
+    Message,
+    MessageError,
+    Points,
+    Tracks,
+    decode,
+    encode,
+    encode_json,
+)
 
 MEGABYTE = 2**20
 SHOWN = 600  # characters that an error may have, path included
@@ -141,6 +153,8 @@ def test_fields_left_out(examples: dict[str, Message], data: st.DataObject, kind
     gone = data.draw(st.sets(st.sampled_from(sorted(plain)), min_size=1))
     error = attempt(msgpack.packb({name: value for name, value in plain.items() if name not in gone}), kind)
     required = {name for name in gone if kind.model_fields[name].is_required() or name == "pose"}
+    if kind is Tracks and not gone.issuperset(PATHS):  # predicted paths are there together
+        required |= gone.intersection(PATHS)
     assert (error is not None) == bool(required)
     if error:
         assert error.code == "missing_field"

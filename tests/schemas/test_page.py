@@ -107,6 +107,7 @@ def test_all_keys_are_on_the_page() -> None:
     made += [keys.query(stream, query) for query in get_args(Query)]
     made += [keys.owner(stream, "instance"), keys.alive("instance")]
     made += [keys.status("instance"), keys.metrics("instance"), keys.move("instance"), keys.drain("instance")]
+    made += [keys.links("area"), keys.links_query("area")]
     said = [re.sub(r"[<>]", "", key) for key in re.findall(r"^\| `(optipmb/v1/[^`]*)`", PAGE, re.MULTILINE)]
     assert sorted(said) == sorted(made)
     assert f"`{keys.all_queries('state')}`" in PAGE

@@ -26,7 +26,7 @@ from typer.main import get_command
 from optipmb_service import __version__
 from optipmb_service.app import ENDING, health_command
 from optipmb_service.app.lifecycle import leave_or_restart
-from optipmb_service.app.processes import run_bridge, run_gateway, run_log, run_ros2, run_router
+from optipmb_service.app.processes import run_bridge, run_gateway, run_link, run_log, run_ros2, run_router
 from optipmb_service.cluster.store import StoreError
 from optipmb_service.settings import (
     DEFAULT_GRPC,
@@ -265,6 +265,18 @@ def mqtt_command(
             _wrong(str(error))
         return
     leave_or_restart(asyncio.run(run_bridge(settings, "mqtt")))
+
+
+@app.command("link")
+@_taking(LogOptions)
+def link_command(**given: Unpack[LogOptions]) -> None:
+    """Link the tracks of streams that see the same objects, a client of routers: see docs/links.md."""
+    settings = _client(given)
+    if not settings.links:
+        _wrong("setting links: expected a table of areas and their streams in --settings, received none")
+    if settings.cluster:
+        _needed("optipmb_service.cluster.jetstream", "cluster")
+    leave_or_restart(asyncio.run(run_link(settings)))
 
 
 @app.command("log")

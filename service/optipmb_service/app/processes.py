@@ -1,4 +1,4 @@
-"""Processes that do not track: the router, the gRPC gateway, and the bridges to MQTT, ROS 2 and the message log.
+"""Processes that do not track: the router, the gRPC gateway, the linker, and the bridges to MQTT, ROS 2, the log.
 
 Each works until SIGINT or SIGTERM and returns the exit status, as `lifecycle.run` does.
 """
@@ -15,7 +15,7 @@ import structlog
 
 from optipmb_service.app.lifecycle import grpc_edge, report_ready, run, run_client, sessions_of, unless
 from optipmb_service.telemetry.health import BEAT_S, Component
-from optipmb_service.telemetry.metrics import LOG_METRICS, PROBLEM_METRICS
+from optipmb_service.telemetry.metrics import LINK_METRICS, LOG_METRICS, PROBLEM_METRICS
 from optipmb_service.zenoh.client import Client
 
 if TYPE_CHECKING:
@@ -93,6 +93,22 @@ async def run_ros2(settings: Settings) -> int:
         return True
 
     return await run(settings, serve)
+
+
+async def run_link(settings: Settings) -> int:
+    from optipmb_service.app.link_bridge import LinkBridge  # noqa: PLC0415 - the tracker, which a router does not load
+
+    async def serve(asked: StopRequest, health: ProcessHealth, client: Client) -> None:
+        bridge = await asyncio.to_thread(LinkBridge, settings, client)
+        health.metrics.add(LINK_METRICS | PROBLEM_METRICS, lambda: bridge)
+        report_ready(settings, health, bridge, "link", ",".join(settings.links))
+        while not asked.is_set():
+            await asked.wait(HOUSEKEEPING_S)
+            await asyncio.to_thread(bridge.work)
+        health.ends()
+        await asyncio.to_thread(bridge.close)
+
+    return await run_client(settings, serve)
 
 
 async def run_log(settings: Settings) -> int:

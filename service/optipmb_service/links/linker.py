@@ -61,6 +61,10 @@ ACCELERATION: Final = 2.0
 """Of an object between its message and the common time, m/s^2."""
 EXISTS: Final = 0.5
 """Least existence of a track where none says that it is confirmed."""
+MISALIGNED: Final = np.array((0.5, 0.5, np.radians(1.0), 0.05))
+"""Biases of place (m), angle (rad) and clock (s) above which streams are misaligned, where they are"""
+LEAST_SIGMAS: Final = 3.0
+"""times their standard deviation."""
 OTHERS: Final = 8
 """Other objects from which the distance of a vector is counted."""
 HOW: Final = ("overlap", "passage", "appearance", "none")
@@ -277,6 +281,26 @@ class Linker:
         """Return all objects that are linked."""
         size = np.bincount(self.part, minlength=1)[self.part]
         return [self._row(n) for n in np.flatnonzero(size > 1).tolist()]
+
+    @property
+    def linked(self) -> int:
+        """How many objects are linked."""
+        size = np.bincount(self.part, minlength=1)
+        return int(size[size > 1].sum())
+
+    def wrong(self) -> dict[tuple[str, str], str]:
+        """Return what is wrong now, by stream and code, with streams whose frames or clocks differ by much."""
+        names = {one.number: one.name for one in self.streams.values()}
+        found = dict(self.problems)
+        for bias in self.biases[self.biases["pairs"] >= 1]:
+            value, sigma = np.abs(bias["estimate"]), np.sqrt(np.diag(bias["covariance"]))
+            far = (value > MISALIGNED) & (value > LEAST_SIGMAS * sigma)
+            if far.any():
+                x, y, turn, late = bias["estimate"].tolist()
+                text = f"its tracks differ by {np.hypot(x, y):.2f} m, {np.degrees(turn):.1f} degrees"
+                text += f" and {1e3 * late:.0f} ms from {names[int(bias['a'])]}"
+                found[names[int(bias["b"])], "misaligned"] = text
+        return found
 
     def _say(self, stream: str, code: str, text: str) -> None:
         """Note that something is wrong with a stream; empty: not any more."""

@@ -61,6 +61,10 @@ CODES: Final = {
         "A JSON frame has the key or the stamp of an earlier one and other content; it is refused.",
         'Send finer stamps, `epoch` and `seq`, or a key for each frame; or set `clock = "arrival"` in `inputs`.',
     ),
+    "links": (
+        "`optipmb-service link` leaves something out, which `path` names, or two streams differ by much.",
+        "Look at `received`: a wrong clock, a frame of another site, too many streams or tracks.",
+    ),
     "shed": ("The queue was full and the oldest frames were dropped.", "Lower the rate, or add processors."),
     "refused": (
         "No room for another session, or a change that needs a restart.",

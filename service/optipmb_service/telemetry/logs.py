@@ -81,6 +81,9 @@ EVENTS: Final = {
     "leases_slow": "Each renewal of the lease has taken more than a quarter of `lease_s`, the last one `took_s`: new"
     " streams begin late. Look for a slow disk or network, or raise `lease_s`.",
     "leases_in_time": "A renewal of the lease was in time again.",
+    "links_torn": "The state of the links of `area` cannot be read: it is set aside, and the one before is taken.",
+    "links_not_saved": "The state of the links cannot be written, for `error`: a restart goes back to the last one.",
+    "links_taken": "Another process links the streams of `area` now: this one does nothing there any more.",
     "message_log_failed": "The message log cannot be written, for `error`: the bridge holds 256 MB of messages and"
     " tries again.",
     "message_log_back": "The message log can be written.",

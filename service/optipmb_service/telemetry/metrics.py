@@ -247,6 +247,18 @@ LOG_METRICS: Final = {
 }
 """Metrics of a bridge into the message log."""
 
+LINK_METRICS: Final = {
+    "links_messages_total": _counter("Tracks taken to be linked.", lambda b: b.messages["taken"]),
+    "links_left_out_total": _counter(
+        "Messages and tracks that were not linked, and links withdrawn, since the beginning of the state.",
+        lambda b: b.counts(),
+        "reason",
+    ),
+    "links_objects": _gauge("Objects that are remembered.", lambda b: b.objects(linked=False), "area"),
+    "links_linked": _gauge("Objects that are linked.", lambda b: b.objects(linked=True), "area"),
+}
+"""Metrics of a process that links tracks."""
+
 TLS_METRICS: Final = {
     "certificate_days": _gauge("Days until a certificate ends; below 0: it has ended.", lambda c: c.days(), "use"),
 }
@@ -267,7 +279,9 @@ MQTT_METRICS: Final = {
 }
 """Metrics of the bridge to MQTT."""
 
-METRICS: Final = SERVICE_METRICS | GATEWAY_METRICS | INPUT_METRICS | LOG_METRICS | MQTT_METRICS | TLS_METRICS
+METRICS: Final = (
+    SERVICE_METRICS | GATEWAY_METRICS | INPUT_METRICS | LINK_METRICS | LOG_METRICS | MQTT_METRICS | TLS_METRICS
+)
 """Every metric. The figures of the process itself start with `process_`."""
 
 
