@@ -184,9 +184,11 @@ def _found(messages: Sequence[Tracks], views: Sequence[View], wrong: dict[str, o
     return ends
 
 
-def passages(seed: int, *, declared: bool, equal_error: float = 0.0, door: bool = False) -> tuple[int, int, int]:
+def passages(
+    seed: int, *, every: float = 25.0, declared: bool, equal_error: float = 0.0, door: bool = False
+) -> tuple[int, int, int]:
     """Return right and wrong links over a corridor, and how many there were to find."""
-    world = corridor(seed)
+    world = corridor(seed, every=every)
     views = [View("site/west/lidar", lambda p: p[:, 0] < 0.0), View("site/east/lidar", lambda p: p[:, 0] > 20.0)]
     if door:  # others come out than go in
         other = corridor(seed + 1000)

@@ -6,9 +6,9 @@ An object that ended at e and one that began at y, a time T later, are one with 
 
 p is the sum of the motion of joining over gaps (`optipmb.joining.rejoin`, where the world frames can be compared), of
 declared passages, and of what beginnings have taught: each of them counts for all ends it may continue, with its odds,
-at the places of both and the time between them, or that times the speed, whichever was steadier. lambda is the rate of
-new objects, in which each beginning counts with the probability that it was new. Kernels of `KERNEL_M` around places
-stand for cells.
+at the places of both and the time between them, and that times the speed, the more the steadier each of the two was.
+lambda is the rate of new objects, in which each beginning counts with the probability that it was new. Kernels of
+`KERNEL_M` around places stand for cells.
 """
 
 from __future__ import annotations
@@ -160,9 +160,12 @@ def _taught(learned: Learned, lost: End, young: End, seconds: Array) -> Array:
         if len(used) == 0:
             continue
         own, weight = known[used], near_end[n, used] * known["weight"][used]
-        found = 0.0
-        for column, value in (("time", time[n]), ("way", time[n] + np.log(speed[n]))):
-            found = found + 0.5 * np.exp(-0.5 * ((value[:, None] - own[column]) / SPREAD) ** 2)
+        values, precision, kernels = {"time": time[n], "way": time[n] + np.log(speed[n])}, [], []
+        for column, value in values.items():
+            mean = np.average(own[column], weights=weight)
+            precision.append(1.0 / (np.average((own[column] - mean) ** 2, weights=weight) + SPREAD**2))
+            kernels.append(np.exp(-0.5 * ((value[:, None] - own[column]) / SPREAD) ** 2))
+        found = np.average(kernels, axis=0, weights=np.square(precision))
         found = found / (np.sqrt(2.0 * np.pi) * SPREAD * seconds[n][:, None])
         total[n] = (found * weight * near_begin[:, used]).sum(axis=1) / (UNKNOWN_ENDS + many[n])
     return total / (2.0 * np.pi * KERNEL_M**2)

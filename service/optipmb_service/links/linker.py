@@ -68,6 +68,7 @@ LEAST_SIGMAS: Final = 3.0
 OTHERS: Final = 8
 """Other objects from which the distance of a vector is counted."""
 HOW: Final = ("overlap", "passage", "appearance", "none")
+APPEARANCE: Final = 2
 NONE: Final = 3
 
 OBJECT: Final = np.dtype([
@@ -510,11 +511,12 @@ class Linker:
         fresh = [n for n, row in enumerate(rows.tolist()) if not np.isnan(look.vectors[row, 0])]
         vectors = {int(numbers[n]): look.vectors[rows[n]] for n in fresh}
         partners = self._partners()
-        for k, (number, vector) in enumerate(vectors.items()):
+        alive = self.objects["number"][self.objects["ended"] == 0]
+        for number, vector in vectors.items():
             kind = int(self.objects["kind"][np.searchsorted(self.objects["number"], number)])
-            old = self.vectors.get(number)
-            others = list(vectors)[k + 1 : k + 1 + OTHERS]
-            self._count(kind, 0, vector, [number, *partners.get(number, ())] if old else partners.get(number, ()))
+            linked = {number, *partners.get(number, ())}
+            others = [one for one in alive.tolist() if one in self.vectors and one not in linked][-OTHERS:]
+            self._count(kind, 0, vector, partners.get(number, ()))
             self._count(kind, 1, vector, others)
         for number, vector in vectors.items():
             total = vector / np.linalg.norm(vector)
@@ -534,7 +536,8 @@ class Linker:
             self.counts[kind, which] *= 0.5
 
     def _partners(self) -> dict[int, list[int]]:
-        linked = self.pairs[(self.pairs["linked"] > 0) & (self.pairs["how"] == 0)]
+        # Within a track vectors are more alike than in two views, and a link by vectors says nothing new of them.
+        linked = self.pairs[(self.pairs["linked"] > 0) & (self.pairs["how"] < APPEARANCE)]
         found: dict[int, list[int]] = {}
         for a, b in zip(linked["a"].tolist(), linked["b"].tolist(), strict=True):
             found.setdefault(a, []).append(b)
@@ -611,7 +614,7 @@ class Linker:
         partner = decision.partner[at]
         pairs["a"], pairs["b"] = own["number"][lost[partner]], own["number"][young[at]]
         pairs["stamp_ns"], pairs["probability"], pairs["linked"] = stamp_ns, decision.probability[at], 1
-        pairs["how"] = np.where(used[partner, at], 2, 1)
+        pairs["how"] = np.where(used[partner, at], APPEARANCE, 1)
         self.pairs = np.concatenate((self.pairs, pairs))
         self.pairs = self.pairs[np.argsort(views.keys_of(self.pairs), kind="stable")]
         return True
