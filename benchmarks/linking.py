@@ -268,9 +268,9 @@ def spread_of(equal_error: float) -> float:
 
 def cost(seed: int) -> tuple[float, float, float]:
     """Return the share of a core for 20 streams at 10 Hz, the tracks of one, and bytes of state for each object."""
-    world = plaza(seed, 20.0, objects=400, half=(150.0, 60.0))
+    world = plaza(seed, 20.0, objects=600, half=(150.0, 60.0))
     places = [(x, y) for x in np.linspace(-130.0, 130.0, 10) for y in (-25.0, 25.0)]
-    views = [View(f"site/n{k}/lidar", circle(x, y, 27.0)) for k, (x, y) in enumerate(places)]
+    views = [View(f"site/n{k}/lidar", circle(x, y, 34.0)) for k, (x, y) in enumerate(places)]
     messages = ordered([copied(world, view, seed) for view in views])
     linker = Linker(Rules("benchmark"))
     half = len(messages) // 2

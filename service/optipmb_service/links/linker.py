@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from optipmb_service.links.rules import Rules
 
     Table = NDArray[np.void]
+    Singles = NDArray[np.float32]
 
 NS: Final = 1e-9
 WAIT_NS: Final = 10**9
@@ -101,18 +102,18 @@ def _unpacked(packed: Any) -> Any:
 
 
 class Look(NamedTuple):
-    """What counts of a message, in the plane of the area."""
+    """What counts of a message, in the plane of the area; small numbers, for it is part of the state."""
 
     stamp_ns: int
     session: int
     object: Index  # (N,)
     id: Index
     place: Array
-    velocity: Array
-    covariance: Array  # (N, 3)
-    variance: Array  # (N,) of the velocity
-    size: Array
-    kind: Index
+    velocity: Singles
+    covariance: Singles  # (N, 3)
+    variance: Singles  # (N,) of the velocity
+    size: Singles
+    kind: NDArray[np.int8]
     age_ns: Index
     since_ns: Index
     vectors: NDArray[np.float32] | None
@@ -372,11 +373,11 @@ class Linker:
             own[rows],
             message.id[rows],
             place.turned(message.center[rows, :2]) + np.array((place.x, place.y)),
-            place.turned(message.velocity[rows]),
-            turned,
-            np.clip(unsure, 1e-3, 1e4),
-            np.log(message.size[rows]),
-            kinds_of(message.labels)[message.label[rows]],
+            place.turned(message.velocity[rows]).astype(np.float32),
+            turned.astype(np.float32),
+            np.clip(unsure, 1e-3, 1e4).astype(np.float32),
+            np.log(message.size[rows]).astype(np.float32),
+            kinds_of(message.labels)[message.label[rows]].astype(np.int8),
             (1e9 * np.minimum(message.age[rows], 1e6)).astype(np.int64),
             (1e9 * np.minimum(message.time_since_detection[rows], 1e6)).astype(np.int64),
             None if vectors is None else vectors[rows],
