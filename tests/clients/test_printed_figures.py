@@ -10,7 +10,7 @@ from optipmb_tools.recordings.record import Recording
 
 
 def said_by_track(capsys: pytest.CaptureFixture[str]) -> str:
-    result: Any = SimpleNamespace(name="a", frames=150, tracks=7, seconds=2.0, step=None, learned=())
+    result: Any = SimpleNamespace(name="a", frames=150, tracks=7, seconds=2.0, step=None, joined=None, learned=())
     track._say_result(result)
     return capsys.readouterr().out
 

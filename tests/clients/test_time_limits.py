@@ -58,7 +58,7 @@ def replaying(clock: Clock, _folder: Path) -> None:
     """Receive until the next frame is due."""
     link: Any = SimpleNamespace(subscribe_streams=lambda *_, **__: None)
     module = optipmb_tools.run.replay
-    exchange = module.Exchange("a/b/c", link, 1, pace=module.Pace(), prefix="optipmb", on_frame=lambda: None)
+    exchange = module.Exchange("a/b/c", link, 1, pace=module.ReplayPace(), prefix="optipmb", on_frame=lambda: None)
     clock.of(module)
     clock.monkeypatch.setattr(exchange, "subscriber", SimpleNamespace(receive=lambda s: clock.wait(s) or None))
     assert exchange.until(clock.now_s + LIMIT_S)
