@@ -36,7 +36,7 @@ import numba
 import numpy as np
 from llvmlite.binding import get_host_cpu_features
 from numba.core import config, event
-from numba.core.caching import IndexDataCacheFile, InTreeCacheLocator
+from numba.core.caching import IndexDataCacheFile, _CacheLocator
 
 try:
     import fcntl
@@ -292,7 +292,7 @@ def _package_folder(folder: Path) -> Path:
     """Return the folder that numba gives to the modules of this file's folder, where it gives `folder` to others."""
     if folder.name == "__pycache__":
         return Path(__file__).parent / folder.name
-    name: str = InTreeCacheLocator.get_suitable_cache_subpath(__file__)  # type: ignore[no-untyped-call]  # as above
+    name: str = _CacheLocator.get_suitable_cache_subpath(__file__)  # type: ignore[no-untyped-call]  # as above
     return folder.parent / name
 
 
