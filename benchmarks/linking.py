@@ -289,6 +289,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="*", default=[1, 2, 3])
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--parts", nargs="*", default=["overlap", "bias", "passages", "door", "cost"])
+    parser.add_argument("--every", type=float, default=60.0, help="mean time between two people in a corridor, s")
     given = parser.parse_args()
     print("| figure | seeds | linked | right |\n| --- | --- | --- | --- |")
     for count in (2, 4, 8) if "overlap" in given.parts else ():
@@ -307,7 +308,8 @@ def main() -> None:
     for declared, error in (
         ((False, 0.0), (False, 0.12), (True, 0.0), (True, 0.12)) if "passages" in given.parts else ()
     ):
-        right, wrong, both = np.sum([passages(n, declared=declared, equal_error=error) for n in given.seeds], axis=0)
+        runs = [passages(n, every=given.every, declared=declared, equal_error=error) for n in given.seeds]
+        right, wrong, both = np.sum(runs, axis=0)
         name = f"passage {'declared' if declared else 'learned'}, {'with' if error else 'without'} vectors"
         share = f"{right} of {both} ({100 * right / both:.0f} %) | {100 * right / max(right + wrong, 1):.1f} %"
         print(f"| {name} | {given.seeds} | {share} |", flush=True)
