@@ -201,7 +201,7 @@ def test_a_fault_of_openlabel_is_named_by_its_place(tmp_path: Path, place: str, 
         ("t.mfjson", ("--origin", ORIGIN), "--option time_origin=TIME"),
         ("t.geojson", (*TIMES, "--full"), "--full"),
         ("t.geojson", ("--origin", ORIGIN, "--option", "time_origin=8:00"), "with its zone"),
-        ("t.geojson", (*TIMES, "--rejoin"), "expected a table"),
+        ("t.geojson", (*TIMES, "--rejoin"), "expected --ids object or a table"),
     ],
 )
 def test_what_a_form_cannot_hold_is_refused(
