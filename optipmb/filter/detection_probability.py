@@ -171,7 +171,7 @@ def count_points(xyz: Coordinates, center: Array, half: Array, yaw: Array, rotat
     for first in range(0, xyz.shape[0], BLOCK):
         block = flat[3 * first : 3 * min(first + BLOCK, xyz.shape[0])]
         cells_of_points(block, x_cells, y_cells, heights, cell_of)
-        count = np.int64(0)  # in Python a plain one would take the type of what is added
+        count = np.int64(0)  # in Python a plain one would take the type of its summands
         for p in range(block.shape[0] // 3):
             near[count] = p
             count += occupied[cell_of[p]]

@@ -9,13 +9,13 @@ P is the probability that an object returns, and f(T) = 1 / (T log(1 + gap / T_0
 p(y, w | i, T) is a mixture along and across the heading of i: the object stays, keeps its velocity up to white noise of
 its acceleration, wanders (its velocity is an Ornstein-Uhlenbeck process), or is anywhere in reach. lambda is the rate
 of new objects, half uniform over the area of the class, half around other beginnings. Each beginning counts with the
-probability that it was new; those of what is there when a session or one of its sensors starts count nothing.
+probability that it was new; objects in view when a session or one of its sensors starts count nothing.
 
-Exits and passages may be declared. What is lost in an exit does not return, and what begins there is new. An object
-that is lost at the start of a passage may be seen again at its end after a time within bounds, which adds a part to
+Exits and passages may be declared. Objects lost in an exit do not return, and objects that begin there are new. An
+object lost at the start of a passage may be seen again at its end after a time within bounds, which adds a part to
 p(y, T | i): most objects keep their speed on the way, the time of the others is uniform. Passages that are not declared
-are learned: each beginning is kept with the tracks that it may continue, weighted by the odds of these. What was lost
-near the place of one returns near the place of the other, after a time in proportion to the speeds.
+are learned: each beginning is kept with the tracks that it may continue, weighted by the odds of these. Objects lost
+near the place of one return near the place of the other, after a time in proportion to the speeds.
 
 The joins are the matching of ends and beginnings with the largest sum of positive s_ij. A join has the probability
 1 / (1 + exp(-m)) with the margin m: the largest sum less the largest one without that pair. Two equal candidates have
@@ -127,7 +127,7 @@ LEARNED_NS: Final = 600 * 10**9
 ELSEWHERE_M: Final = 6.0
 """Returns nearer to where they were lost teach nothing: motion says more, and at a door others come out."""
 LEARNED: Final = 0.8
-"""Share of the returns that are as those of others, if many are known; it is half from"""
+"""Share of the returns that are like others, if many are known; it is half from"""
 FIRST_RETURNS: Final = 0.5
 """this sum of weights on."""
 LEAST_WEIGHT: Final = 0.002
@@ -178,7 +178,7 @@ class Rejoin:
         decide_s: time from the first detection of a track to its decision, s.
         most: lost objects that are kept; then the oldest are dropped.
         embedding_model: model whose vectors are compared; None: none are.
-        exits: polygons of the world frame, m, as doors: what is lost inside is gone, and what begins inside is new.
+        exits: polygons of the world frame, m, as doors: objects lost inside are gone, and others are new.
         passages: ways on which objects are not detected.
 
     Raises:
@@ -901,7 +901,7 @@ def _scores(
 ) -> tuple[Array, Array]:
     """Return s_ij (E, M) of ends and beginnings, NaN or -inf where they are not joined, and its part by appearance.
 
-    Only what is connected with a decision by pairs that may be joined is scored.
+    Only pairs connected with a decision by pairs that may be joined are scored.
 
     Args:
         tables: lost objects, live tracks, beginnings, returns and statistics of classes.

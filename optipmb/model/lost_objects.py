@@ -19,7 +19,7 @@ PLACES: Final = 13
 EMBEDDING: Final = (2, 512)
 """Least and most numbers of a vector of appearance."""
 SETTLES_NS: Final = 2 * 10**9
-"""Time after the start of a session or of a sensor in which beginnings are of what was there before."""
+"""Time after the start of a session or of a sensor in which beginnings are of objects that were there before."""
 DISTANCES: Final = 26
 """Bins of the distances of vectors of appearance."""
 
@@ -113,7 +113,7 @@ class Beginnings(Rows):
 
 
 class Returns(Rows):
-    """Beginnings with what they may continue: where and after which time objects return that are lost at a place.
+    """Beginnings with the tracks that they may continue: where and when objects return that are lost at a place.
 
     Attributes:
         id: (N,) int64 of the track that began.
@@ -144,7 +144,7 @@ class Statistics(Rows):
 
     Attributes:
         since_ns: (C,) int64 stamp from which beginnings are counted.
-        settled_ns: (C,) int64 stamp before which a beginning is of what was there when a session or sensor started.
+        settled_ns: (C,) int64 stamp before which a beginning is of an object in view when a session or sensor started.
         count: (C, 3) tracks whose length, width and height are known.
         mean: (C, 3) of their logarithms.
         square: (C, 3) sum of squared differences from it.
@@ -227,6 +227,6 @@ class Rejoining:
         return cls(Tracklets.empty(), Places.empty(), Lost.empty(), Beginnings.empty(), Returns.empty(), known)
 
     def with_sensor(self, stamp_ns: int) -> Rejoining:
-        """Return the state before the first frame of another sensor, which sees what was there before."""
+        """Return the state before the first frame of another sensor, which sees objects that were there before."""
         settled = np.full(len(self.classes), stamp_ns + SETTLES_NS)
         return replace(self, classes=self.classes.replaced(settled_ns=settled))

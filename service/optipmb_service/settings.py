@@ -588,8 +588,8 @@ class RejoinSettings(BaseModel):
     embedding_model: str | None = Field(default=None, min_length=1, max_length=64)
     """model whose vectors (`embedding` of Detections) are compared; vectors of other models are ignored"""
     exits: tuple[Shape, ...] = ()
-    """polygons of 3 to 100 corners in the world frame, m, as doors: what is lost inside is gone, and what begins inside
-    is new; with passages at most 64"""
+    """polygons of 3 to 100 corners in the world frame, m, as doors: objects lost inside are gone, and objects that
+    begin inside are new; with passages at most 64"""
     passages: tuple[PassageSettings, ...] = ()
     """ways on which objects are not detected"""
 

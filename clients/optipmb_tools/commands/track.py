@@ -97,7 +97,7 @@ class TrackOptions:
     ] = None
     ids: Annotated[
         str,
-        typer.Option(metavar="track|object", help="With --rejoin, object: ids are those of objects, in any format."),
+        typer.Option(metavar="track|object", help="With --rejoin, object: ids of objects, in any format."),
     ] = "track"
     keep_input: Annotated[
         bool, typer.Option("--keep-input", help="Of a bag, with --out FILE.mcap: also copy what is in it.")

@@ -140,7 +140,7 @@ class Objects:
         return {"object": number, "object_probability": probability}
 
     def as_ids(self, tracks: Tracks) -> Tracks:
-        """Return the tracks of a frame with their objects as ids, without those that a later track has replaced."""
+        """Return the tracks of a frame with their objects as ids, without tracks that a later one has replaced."""
         number = self.columns(tracks.id, np.full(len(tracks.id), tracks.stamp_ns))["object"]
         replaced = (number < 0) & np.isin(tracks.id, self.id)
         identity = np.where(number < 0, tracks.id, number)

@@ -1,7 +1,7 @@
 """Joining of the tracks of a recording over gaps, by the scores and the matching of `optipmb.joining.rejoin`.
 
 Beginnings before and after a track count for the rate of new objects, with the probabilities to be new that `TURNS`
-turns estimate. What is there when a recording starts has not begun then, and counts nothing.
+turns estimate. Objects in view when a recording starts have not begun then, and count nothing.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,7 @@
 """The role that links the tracks of streams: reads tracks, publishes which of their objects are one.
 
 Each area has a `Linker`, whose state is a checkpoint in the store of the sessions. After a restart the caches of the
-publishers bring what was missed. Of two processes with one area the later one goes on: it takes the fence, and the
+publishers bring the missed frames. Of two processes with one area the later one goes on: it takes the fence, and the
 other one is refused when it saves.
 """
 
@@ -295,7 +295,7 @@ class LinkBridge(Component):
 
 
 def _whole(pattern: str) -> str:
-    """Return a pattern whose parts are `*` or names; what it matches beyond is left out later."""
+    """Return a pattern whose parts are `*` or names; further matches are left out later."""
     return "/".join("*" if "*" in part else part for part in pattern.split("/"))
 
 

@@ -527,7 +527,7 @@ def _of_object(
 
 
 def _calls(fields: Any, received: str) -> str:
-    """Return what was received, with our name for a field that other senders call otherwise."""
+    """Return the text of the received value, with our name for a field that other senders call otherwise."""
     known = next((name for name in fields if name in _MEANT), None) if isinstance(fields, dict) else None
     return received if known is None else f"{received}; {known} is {_MEANT[known]} here"
 

@@ -296,7 +296,7 @@ class Bridge(Component):
         """Size that ended connections, and when, by topic."""
 
     def add_metrics(self, metrics: Metrics) -> None:
-        """Add the figures of the bridge, and of its inputs, to those of the process."""
+        """Add the figures of the bridge and of its inputs to the metrics of the process."""
         metrics.add(MQTT_METRICS, lambda: self)
         metrics.add(INPUT_METRICS, lambda: self.inputs)
 

@@ -45,7 +45,7 @@ UNKNOWN_ENDS: Final = 1.0
 DECLARED: Final = 0.9
 """Share of the objects in a declared passage that come out of it."""
 ANYHOW: Final = 0.05
-"""Share of objects that come back elsewhere than they moved to; where nobody knows where that is, it is `RETURNS`."""
+"""Share of objects that come back elsewhere than they moved to; where that place is not known, it is `RETURNS`."""
 LEAST_SPEED: Final = 0.3
 MOST_ODDS: Final = 1e12
 LIMIT: Final = Motion._fields.index("limit")
@@ -188,7 +188,7 @@ def _inside(region: Region, names: dict[int, str], which: End) -> NDArray[np.boo
 
 
 class Decision(NamedTuple):
-    """What comes of beginnings (Y,): the row of the lost object of each, -1 for a new one, and its probability."""
+    """Decisions on beginnings (Y,): the row of the lost object of each, -1 for a new one, and its probability."""
 
     partner: Index
     probability: Array
@@ -218,7 +218,7 @@ def decide(
     seconds = np.maximum((young.stamp_ns - lost.stamp_ns[:, None]) * 1e-9, 1e-3)
     fits = (young.stamp_ns > lost.stamp_ns[:, None]) & (seconds <= rules.gap_s)
     fits &= (lost.kind[:, None] == young.kind) | (lost.kind[:, None] == 0) | (young.kind == 0)
-    # Nobody is faster than the kind allows, whatever was taught.
+    # No object is faster than its kind allows, also on learned ways.
     apart = np.hypot(*np.moveaxis(young.place - lost.place[:, None], 2, 0))
     reach = MOTION.motion[lost.kind, LIMIT][:, None] * seconds + REACH_M
     fits &= (lost.plane[:, None] != young.plane) | (apart <= reach)
@@ -252,7 +252,7 @@ def decide(
 
 
 def _learnt(learned: Learned, lost: End, young: End, share: Array, seconds: Array, due: NDArray[np.bool_]) -> Learned:
-    """Return what is known after the beginnings that were decided."""
+    """Return the state after the beginnings that were decided."""
     before, after = np.nonzero((share >= LEAST_WEIGHT) & due & young.known)
     more = np.zeros(len(before), EXAMPLE)
     more["begin"], more["end"] = lost.stream[before], young.stream[after]

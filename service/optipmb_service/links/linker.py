@@ -50,7 +50,7 @@ DECIDE_VECTORS_NS: Final = 2 * 10**9
 START_NS: Final = 2 * 10**9
 """Objects that are there within this time of the start of a session have not begun there."""
 CLOCK_NS: Final = 2 * 10**9
-"""Largest difference of a stream's clock from those of most others."""
+"""Largest difference of a stream's clock from most other clocks."""
 STUCK_NS: Final = 5 * 10**9
 """A stream whose stamps have been behind for so long has set its clock back."""
 MOST_STREAMS: Final = 64
@@ -79,7 +79,7 @@ OBJECT: Final = np.dtype([
     ("known", "i1"), ("ended", "i1"), ("told", "i1"),
 ])  # fmt: skip
 """An object of a session: ends in the plane of the area; `known`: it began while it was looked for; `told`: bits of
-what was published last (1: anything, 2: the end)."""
+kind of the last publication (1: any, 2: the end)."""
 
 
 VERSION: Final = 1
@@ -149,7 +149,7 @@ class Stream:
 
 
 class Row(NamedTuple):
-    """What is known of one object of a session."""
+    """State of one object of a session."""
 
     global_id: bytes
     stream: str
@@ -186,7 +186,7 @@ class Linker:
         self.counts = np.zeros((len(KINDS), 2, DISTANCES))
         self.counters: collections.Counter[str] = collections.Counter()
         self.problems: dict[tuple[str, str], str] = {}
-        """What is wrong now, by stream and code."""
+        """Present problems, by stream and code."""
         self.part: Index = np.zeros(0, np.int64)
         """Part of each object."""
         self._changes: list[Row] = []
@@ -275,7 +275,7 @@ class Linker:
         return linker
 
     def changes(self) -> list[Row]:
-        """Return what has changed since the last call."""
+        """Return the rows that changed since the last call."""
         found, self._changes = self._changes, []
         return found
 
@@ -291,7 +291,7 @@ class Linker:
         return int(size[size > 1].sum())
 
     def wrong(self) -> dict[tuple[str, str], str]:
-        """Return what is wrong now, by stream and code, with streams whose frames or clocks differ by much."""
+        """Return the present problems, by stream and code, with streams whose frames or clocks differ by much."""
         names = {one.number: one.name for one in self.streams.values()}
         found = dict(self.problems)
         for bias in self.biases[self.biases["pairs"] >= 1]:
@@ -314,7 +314,7 @@ class Linker:
             self.problems.pop((stream, code), None)
 
     def _is_off(self, stream: Stream, arrived_ns: int) -> bool:
-        """Return whether the clock of a stream is far from those of most others."""
+        """Return whether the clock of a stream is far from most other clocks."""
         others = [
             one.offset_ns
             for one in self.streams.values()
@@ -327,7 +327,7 @@ class Linker:
         if abs(apart) <= CLOCK_NS:
             self._say(stream.name, "wrong_clock", "")
             return False
-        self._say(stream.name, "wrong_clock", f"its stamps are {apart * NS:+.1f} s from those of other streams")
+        self._say(stream.name, "wrong_clock", f"its stamps are {apart * NS:+.1f} s from other streams")
         return True
 
     def _is_next(self, stream: Stream, message: Tracks, arrived_ns: int) -> bool:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from optipmb.world.zones import Point
 
 KINDS: Final = ("", "car", "bicycle", "pedestrian")
-"""Kinds of objects that are told apart, by the common name of one of their classes; `""`: any other class."""
+"""Kinds of objects that are distinguished, by the common name of one of their classes; `""`: any other class."""
 _KIND_OF: Final = {motion_of(name): number for number, name in enumerate(KINDS)}
 AREA_M2: Final = 1e4
 """Area over which new objects are spread where nothing is known of them."""

@@ -57,7 +57,7 @@ PAIR: Final = np.dtype([
     ("a", "i8"), ("b", "i8"), ("evidence", "f8"), ("stamp_ns", "i8"), ("samples", "i4"), ("probability", "f4"),
     ("linked", "i1"), ("how", "i1"),
 ])  # fmt: skip
-"""Two objects by number, that of the earlier stream first; `how`: 0 overlap, 1 passage, 2 appearance."""
+"""Two objects by number, the one of the earlier stream first; `how`: 0 overlap, 1 passage, 2 appearance."""
 BIAS: Final = np.dtype([
     ("a", "i8"), ("b", "i8"), ("center", "f8", 2), ("info", "f8", (4, 4)), ("eta", "f8", 4), ("pairs", "f8"),
     ("estimate", "f8", 4), ("covariance", "f8", (4, 4)),
