@@ -3,7 +3,7 @@
 Row by row an object is shown late, and again and again for a moment only. Where later frames are known, a track is
 shown as a whole, from its first detection to its last, gaps included, or not at all:
 
-    logit p = mean of logit p_j over the frames j of the track up to its last detection - `AGAINST` / h
+    logit p = `TOGETHER` (mean of logit p_j over the frames j of the track up to its last detection - `AGAINST` / h)
 
 with log odds of at most `SURE`, and h detections: a track of few needs them surer. It is confirmed from `confirm_from`
 on, at most from `EVEN`. The frames after the last detection keep their existence, and are not confirmed. Recordings and
@@ -46,6 +46,8 @@ ROUNDING: Final = 1e-6
 """Of the difference of two ages, s."""
 AGAINST: Final = 2.0
 """Log odds against a track, which its detections have to outweigh together."""
+TOGETHER: Final = 1.6
+"""Log odds of all frames of a track, in units of their mean."""
 EVEN: Final = 0.5
 """Existence from which showing a track is right more often than not."""
 
@@ -78,7 +80,7 @@ def with_hindsight(
     shown = place <= np.maximum.reduceat(detected, first)[track] if len(order) else detected >= 0
     total = np.bincount(track, np.where(shown, _log_odds(existence[order]), 0.0), len(first))
     odds = total / np.maximum(np.bincount(track, shown, len(first)), 1.0)
-    odds -= AGAINST / np.maximum(np.bincount(track, detected >= 0, len(first)), 1.0)
+    odds = TOGETHER * (odds - AGAINST / np.maximum(np.bincount(track, detected >= 0, len(first)), 1.0))
     existence[order] = np.where(shown, 1.0 / (1.0 + np.exp(-odds[track])), existence[order])
     least = np.array([min(one.confirm_from, EVEN) if show is None else show for one in parameters.classes.values()])
     changed: dict[str, NDArray[Any]] = {"existence": existence, "confirmed": shown[back] & (existence >= least[label])}

@@ -37,7 +37,8 @@ def test_existence_is_by_the_mean_log_odds_of_the_track_up_to_its_last_detection
     detections = {1: 1, 2: 2, 5: 1, 7: 2, 9: 1}
     for given, columns in zip(frames, found, strict=True):
         for k, identity in enumerate(given.id.tolist()):
-            mean = float(np.mean([math.log(p / (1.0 - p)) for p in odds[identity]])) - 2.0 / detections[identity]
+            mean = float(np.mean([math.log(p / (1.0 - p)) for p in odds[identity]]))
+            mean = 1.6 * (mean - 2.0 / detections[identity])
             ended = identity == 7 and given is frames[2]
             wanted = 0.8 if ended else 1.0 / (1.0 + math.exp(-mean))
             assert columns["existence"][k] == pytest.approx(wanted, rel=1e-9)
@@ -49,7 +50,7 @@ def test_a_track_is_confirmed_as_a_whole() -> None:
     """Clutter that fades was never confirmed, an object that becomes sure was from its first frame on."""
     frames = [tracks({1: 0.6, 2: 0.3}), *[tracks({1: 0.2, 2: 0.9})] * 3]
     assert [one["confirmed"].tolist() for one in with_hindsight(frames, PARAMETERS)] == [[False, True]] * 4
-    shown = with_hindsight(frames, PARAMETERS, show=0.15)
+    shown = with_hindsight(frames, PARAMETERS, show=0.05)
     assert [one["confirmed"].tolist() for one in shown] == [[True, True]] * 4
 
 
