@@ -201,8 +201,9 @@ class FrameReader:
         if (other := other_value(payload, only)) is not None:
             path, received = other
             raise invalid(path, f"{show(only[path])}, by `only` in `inputs`", received)
+        mapping = self._mapping(stream)
         try:
-            if (mapping := self._mapping(stream)) is not None:
+            if mapping is not None:
                 return self._mapped(msgspec.json.decode(payload), stream, mapping)
             return self._made(_frame.decode(payload), stream)
         except msgspec.ValidationError as error:
@@ -211,7 +212,8 @@ class FrameReader:
                 return self._columns(fields, stream)
             raise _invalid(error, fields) from None
         except schemas.MessageError as error:
-            if (at := _ELEMENT.fullmatch(error.path)) and error.received == "none":  # it says no place
+            at = _ELEMENT.fullmatch(error.path) if mapping is None and error.received == "none" else None
+            if at and at[1] == "objects":  # it says no place
                 received = _calls(msgspec.json.decode(payload)["objects"][int(at[2])], error.received)
                 raise schemas.MessageError(error.code, error.path, error.expected, received) from None
             raise
@@ -546,7 +548,8 @@ def _invalid(error: msgspec.ValidationError, document: Any) -> schemas.MessageEr
     for part in re.findall(r"\w+", path):
         document = document[int(part) if part.isdigit() else part]
     if match := re.fullmatch(r"Object missing required field `(.*)`", text):
-        received = _calls(document, "nothing")
+        meant = {name: None for name in document if _MEANT.get(name) == match[1]} or document
+        received = _calls(meant, "nothing")
         return schemas.MessageError("missing_field", f"{path}.{match[1]}".removeprefix("."), "a value", received)
     if match := re.fullmatch(r"Object contains unknown field `(.*)`", text, re.DOTALL):
         expected = f"one of {', '.join(EdgeDetections.__struct_fields__)}"

@@ -177,6 +177,15 @@ def test_a_payload_of_another_maker_is_a_frame(start: Any, way: str) -> None:
     assert sorted(tracks.center[:, 0].tolist()) == [-9.0, 9.0]
 
 
+def test_an_object_of_another_maker_without_a_place_is_refused_with_its_path() -> None:
+    """Fields of a mapped payload have the maker's names, whatever ours are."""
+    mapping = {"objects": "items[]", "class": "kind", "position": "at"}
+    reader = FrameReader(Settings(inputs={SENSOR.stream: {"format": "mapped", "mapping": mapping}}))
+    with pytest.raises(MessageError) as raised:
+        reader.read(json.dumps({"items": [{"kind": "car", "bbox": [0, 0, 9, 9]}]}).encode(), SENSOR.stream)
+    assert (raised.value.path, raised.value.received) == ("items[0]", "none")
+
+
 def test_incomplete_frames_say_nothing_of_other_objects(start: Any) -> None:
     """An object without a report for 9 s keeps its id, and ends after `missing_s`; frames sent again count once."""
     rules = {"site/*/lidar": {"complete": False, "missing_s": 10}}
@@ -409,6 +418,7 @@ def test_an_error_names_the_path(fields: dict[str, Any], code: str, path: str) -
     ("fields", "path", "ours"),
     [
         ({"objects": [{"label": "car", "position": [0, 0]}]}, "objects[0].class", "label is class here"),
+        ({"objects": [{"x": 1, "y": 2, "label": "car"}]}, "objects[0].class", "label is class here"),
         ({"objects": [{"class": "car", "bbox": [0, 0, 9, 9]}]}, "objects[0]", "bbox is box here"),
         ({"objects": [CAR, {"class": "car", "x": 1, "y": 2}]}, "objects[1]", "x is position here"),
         ({"objects": [], "timestamp": 1.5}, "timestamp", "timestamp is time or stamp_ns here"),
