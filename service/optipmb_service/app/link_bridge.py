@@ -21,7 +21,7 @@ import structlog
 from optipmb import Georeference
 from optipmb_service.app.storage import open_store
 from optipmb_service.cluster.store import Fenced, StoreError, Write, load_newest
-from optipmb_service.links.linker import Linker
+from optipmb_service.links.linker import MOST_STREAMS, Linker
 from optipmb_service.links.rules import Passage, Placement, Region, Rules
 from optipmb_service.session.problems import problem_of
 from optipmb_service.telemetry.health import Component
@@ -273,6 +273,9 @@ class LinkBridge(Component):
             return
         if content.embedding_model not in {area.settings.embedding_model for area in areas}:
             self.messages["other_model"] += 1
+            return
+        if content.stream not in self._vectors and len(self._vectors) >= MOST_STREAMS * len(self.areas):
+            self.messages["too_many_streams"] += 1
             return
         kept = self._vectors.setdefault(content.stream, OrderedDict())
         newest = next(reversed(kept.values()), None)
