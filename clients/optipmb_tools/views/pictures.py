@@ -31,6 +31,7 @@ _MARGIN = 6.0
 _MARKERS = "os^vDPX*"  # of classes
 _BREAK = 5  # a path is not drawn across more missing frames than this
 _NEAR_M = 2.0  # as far as tracks of an object may be in figures of centres
+_ENTRY_IN = 2.6  # width of an entry of the legend
 
 # Of moving pictures
 FRAMES = 70  # of a longer sequence every second frame is drawn, or every third …
@@ -237,7 +238,7 @@ def _draw_unconfirmed(axes: "Axes", truth: Truth, misses: list[int], tracks: Res
 
 def _legend(figure: "Figure", grid: "Sequence[Axes]") -> None:
     found = {label: one for axes in grid for one, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    columns = max(1, min(4, len(found)))
+    columns = max(1, min(4, len(found), int(figure.get_figwidth() / _ENTRY_IN)))
     figure.legend(found.values(), found, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
 
 
