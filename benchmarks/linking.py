@@ -1,9 +1,8 @@
-"""Links between the tracks of streams: `python benchmarks/linking.py [--seeds 1 2 3] [--root data]`.
+"""Links between the tracks of streams: `python benchmarks/linking.py [--seeds 1 2 3]`.
 
 Prints a table as Markdown: generated sites of two to eight streams with 100 objects (`tests/support/sites.py`), tracked
 by the tracker with the profile for unknown detectors. An object is common while two streams have a confirmed track of
-it. A link is right if both tracks are mostly of one object. With `--root` two detectors of one drive of nuScenes are
-linked as two streams.
+it. A link is right if both tracks are mostly of one object.
 """
 
 from __future__ import annotations
@@ -147,10 +146,18 @@ def views_of(count: int) -> list[View]:
     return [View(f"site/n{k}/lidar", circle(x, y, 38.0)) for k, (x, y) in enumerate(places)]
 
 
-def overlap(seed: int, count: int, seconds: float, **wrong: object) -> tuple[Figures, Linker, list[float]]:
-    """Link a plaza; `wrong` holds for the second stream."""
+def overlap(
+    seed: int,
+    count: int,
+    seconds: float,
+    *,
+    shift: tuple[float, float] = (0.0, 0.0),
+    turn: float = 0.0,
+    late: float = 0.0,
+) -> tuple[Figures, Linker, list[float]]:
+    """Link a plaza, whose second stream has another place, angle and clock."""
     world, views = plaza(seed, seconds), views_of(count)
-    views[1] = replace(views[1], **wrong)
+    views[1] = replace(views[1], shift=shift, turn=turn, late=late)
     messages, owner = [], {}
     for view in views:
         tracks, sources = tracked(world, view, seed)
@@ -158,10 +165,10 @@ def overlap(seed: int, count: int, seconds: float, **wrong: object) -> tuple[Fig
         owner |= owners(tracks, sources)
     given = ordered(messages)
     linker, after = linked(Rules("benchmark"), given)
-    return judge(given, after, owner), linker, _found(given, views, wrong) if wrong else []
+    return judge(given, after, owner), linker, _found(given, views) if late else []
 
 
-def _found(messages: Sequence[Tracks], views: Sequence[View], wrong: dict[str, object]) -> list[float]:
+def _found(messages: Sequence[Tracks], views: Sequence[View]) -> list[float]:
     """Return after how many seconds place, angle and clock are within .1 m, .2 degrees and 20 ms, for good."""
     linker, ends, begin = Linker(Rules("benchmark")), [0.0, 0.0, 0.0], messages[0].stamp_ns
     for one in messages:
@@ -169,14 +176,14 @@ def _found(messages: Sequence[Tracks], views: Sequence[View], wrong: dict[str, o
         if not len(linker.biases):
             continue
         bias = linker.biases[0]
-        turn, shift = float(wrong["turn"]), np.array(wrong["shift"])  # type: ignore[arg-type]
-        center = bias["center"] - views[1].center
+        wrong = views[1]
+        center = bias["center"] - wrong.center
         # What the second stream says of a place, less the place: by the turn about its centre, and the shift.
-        own = np.array((-center[1], center[0])) * turn + shift
+        own = np.array((-center[1], center[0])) * wrong.turn + wrong.shift
         errors = (
             np.hypot(*(bias["estimate"][:2] + own)) / 0.1,
-            abs(bias["estimate"][2] + turn) / np.radians(0.2),
-            abs(bias["estimate"][3] - float(wrong["late"])) / 0.02,  # type: ignore[arg-type]
+            abs(bias["estimate"][2] + wrong.turn) / np.radians(0.2),
+            abs(bias["estimate"][3] - wrong.late) / 0.02,
         )
         for k, error in enumerate(errors):
             if error > 1.0:

@@ -292,7 +292,7 @@ def _package_folder(folder: Path) -> Path:
     """Return the folder that numba gives to the modules of this file's folder, where it gives `folder` to others."""
     if folder.name == "__pycache__":
         return Path(__file__).parent / folder.name
-    name: str = _CacheLocator.get_suitable_cache_subpath(__file__)  # type: ignore[no-untyped-call]  # as above
+    name: str = _CacheLocator.get_suitable_cache_subpath(__file__)  # type: ignore[no-untyped-call]  # as above; numba 0.61 has no public locator
     return folder.parent / name
 
 

@@ -1292,8 +1292,15 @@ def rejoin_tracks(
         limits,
         tuple(vectors),
     )
-    kinds_of = Tracklets, Places, Lost, Beginnings, Returns, Statistics
-    after = Rejoining(*(kind.of(one) for kind, one in zip(kinds_of, words, strict=True)))  # type: ignore[arg-type]
+    live, places, lost, begun, returns, known = words
+    after = Rejoining(
+        Tracklets.of(live),
+        Places.of(places),
+        Lost.of(lost),
+        Beginnings.of(begun),
+        Returns.of(returns),
+        Statistics.of(known),
+    )
     if looks is not None:
         after = replace(after, appearance=aligned(*looks, state.lost, after.live, after.lost))
     density = replace(density, rejoining=after)
