@@ -3,10 +3,13 @@
 An unexpected error is one line too, with the input that was being read; `--debug` shows its traceback.
 """
 
+import atexit
 import inspect
+import os
 import re
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
@@ -211,7 +214,25 @@ def _line_of(error: Exception, command: str) -> tuple[int, str]:
 def main() -> NoReturn:
     """Run the command line of this process and exit."""
     signal.signal(signal.SIGTERM, _terminate)
-    sys.exit(run(sys.argv[1:]))
+    status = TERMINATED
+    atexit.register(lambda: _leave(status))  # the first one, which is called last
+    try:
+        status = run(sys.argv[1:])
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)  # the status stands; an exception would only be a traceback
+    sys.exit(status)
+
+
+def _leave(status: int) -> None:
+    """End the process at once where a daemon thread is left, such as one that opens a session.
+
+    It may be in machine code: to return from there to an interpreter that ends aborts the process.
+    """
+    if any(one.daemon for one in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
 
 
 def _terminate(_number: int, _frame: FrameType | None) -> NoReturn:

@@ -216,6 +216,36 @@ def test_a_signal_ends_a_replay_cleanly(endpoint: str, tmp_path: Path, number: i
     assert list(tmp_path.iterdir()) == []
 
 
+INTERRUPTED_TWICE = """
+import atexit, os, sys, threading, time
+from optipmb_tools import cli
+
+class End:
+    def __del__(self, sleep=time.sleep):
+        sleep(3)  # the interpreter ends meanwhile
+
+end, number = End(), int(sys.argv.pop())
+
+def interrupt():
+    while all(one.name != "open" for one in threading.enumerate()):
+        time.sleep(0.01)
+    atexit.register(os.kill, os.getpid(), number)
+    os.kill(os.getpid(), number)
+
+threading.Thread(target=interrupt).start()
+cli.main()
+"""
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_end_a_command_that_waits_for_a_router(number: int, status: int) -> None:
+    """The wait may end while the interpreter does, and a second signal may come then: neither aborts the process."""
+    words = ("status", "--connect", free_endpoint(), "--timeout", "1", str(int(number)))
+    command = (sys.executable, "-c", INTERRUPTED_TWICE, *words)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (status, "optipmb: interrupted\n" if status == 130 else "")
+
+
 @pytest.mark.parametrize("debug", [[], ["--debug"]])
 def test_an_error_that_no_code_foresaw_is_one_line(
     debug: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
