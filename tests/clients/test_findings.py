@@ -1,6 +1,7 @@
 """Tables of unknown sources: correct columns are read, wrong ones are refused or named with the remedy."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from commands import run_here
 from optipmb_tools.datasets import DatasetError
 from optipmb_tools.datasets.evidence import Evidence
 from optipmb_tools.datasets.table import TableDataset
-from optipmb_tools.datasets.table.findings import Finding
+from optipmb_tools.datasets.table.findings import Claim, Finding, Reading
 from optipmb_tools.results.output import TrackCounts
 from optipmb_tools.run.profiles import profile_for
 from optipmb_tools.run.tracking import track_whole
@@ -539,6 +540,20 @@ def test_stronger_evidence_needs_numbers_and_a_difference() -> None:
     assert not Evidence(2, 2).beats(Evidence(0, 2))
     assert not Evidence(990, 1000).beats(Evidence(950, 1000))
     assert Evidence(50, 50).beats(Evidence(20, 50))
+
+
+def test_a_meaning_that_values_rule_out_gives_way(tmp_path: Path) -> None:
+    """The first possible one holds without evidence, the user's choice always; where none or several are, they ask."""
+    reading = Reading(tmp_path, {})
+    out, other = Claim("a", possible=False), Claim("b", text="b holds")
+    assert reading.decide("time", [out, other]) == "b"
+    assert [(one.text, one.doubt) for one in reading.findings] == [("b holds", False)]
+    assert reading.decide("time", [out, other], asked="a") == "a"
+    for claims in ([out], [other, other]):
+        with pytest.raises(DatasetError, match="expected a unit, received steps of 1"):
+            reading.decide("time", claims, expected="a unit", received="steps of 1")
+    with pytest.raises(DatasetError, match="expected a unit, received b holds"):
+        reading.decide("time", [out, replace(other, wins="refused")], expected="a unit")
 
 
 def test_check_ends_with_the_status_of_its_findings(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,8 +22,12 @@ def read_angle(reading: Reading, name: str, values: Floats, unit: str | None) ->
     chosen = reading.chosen("yaw", ("degrees", "radians")) or ANGLE_UNITS.get(unit or "")
     if chosen is None:
         most = float(np.nanmax(np.abs(values), initial=0.0))
-        chosen = "degrees" if most > FULL_TURN else "radians"
-        reading.note("pose", f"{name} is taken for {chosen} (up to {most:.4g})", "--option yaw=degrees, radians")
+        text, option = "{} is taken for {} (up to {:.4g})", "--option yaw=degrees, radians"
+        claims = [
+            Claim(one, text=text.format(name, one, most), option=option, possible=one == "degrees" or most <= FULL_TURN)
+            for one in ("radians", "degrees")
+        ]
+        chosen = reading.decide("pose", claims)
     return np.deg2rad(values) if chosen == "degrees" else values
 
 
@@ -50,10 +54,15 @@ def read_turn(reading: Reading, topic: str, parts: Floats, *, named: bool) -> Fl
         )
         for order, places in (("wxyz", [1, 2]), ("xyzw", [0, 1]))
     ]
-    if asked is None and len(level) and min(one.evidence.share for one in claims) == 1.0:
-        expected = "quaternions whose order is told by upright boxes"
-        reading.refuse(topic, expected, "boxes that all have one of two headings", claims[0].option)
-    order = reading.decide(topic, claims, "boxes then stand upright", asked=asked)
+    alike = min(one.evidence.share for one in claims) == 1.0
+    order = reading.decide(
+        topic,
+        claims,
+        "boxes then stand upright",
+        expected="quaternions whose order is told by upright boxes",
+        received="boxes that all have one of two headings" if alike else "",
+        asked=asked,
+    )
     return parts[:, [3, 0, 1, 2]] if order == "xyzw" else parts
 
 

@@ -1,7 +1,7 @@
 """Findings about a table: assumptions, doubts and errors, with the evidence and the option that corrects each.
 
 An option of the user holds, then what the name of a column says, then the first way to read the values, unless another
-way has the stronger evidence (`Evidence.beats`). `Reading.decide` alone compares evidence.
+way has the stronger evidence (`Evidence.beats`), or the values rule it out. `Reading.decide` alone compares evidence.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -37,11 +37,16 @@ class Claim:
     """One way to read values, and how many of them agree with it."""
 
     value: str  # of the option that chooses it
-    evidence: Evidence
+    evidence: Evidence = field(default_factory=Evidence)
     text: str = ""
     option: str = ""
     wins: Literal["taken", "doubt", "refused"] = "taken"  # what happens to the table where it has the best evidence
     sure: bool = True  # whether there is enough evidence to refuse by
+    possible: bool = True  # whether the values can have this meaning
+
+    def beats(self, other: "Claim") -> bool:
+        """Tell whether this is the better way: the only possible one, or that with the stronger evidence."""
+        return self.possible and (not other.possible or self.evidence.beats(other.evidence))
 
 
 @dataclass(frozen=True)
@@ -128,32 +133,36 @@ class Reading:
         *,
         clash: str = "",
         expected: str = "",
+        received: str = "",
         asked: str | None = None,
         least: float = 0.0,
     ) -> str:
-        """Return the value of the claim that holds; report it, or a rival with the stronger evidence.
+        """Return the value of the claim that holds; report it, or a rival that beats it.
 
         Args:
             topic: Of the findings.
-            claims: The first one holds unless another one has the stronger evidence.
+            claims: The first one holds unless another one beats it.
             things: Noun and verb behind a share, as in "moves are along it"; empty: shares are not shown.
             clash: Text of the doubt where the evidence contradicts the claim that holds.
             expected: For the error.
+            received: For the error where not exactly one claim is possible, and the user has to choose.
             asked: Value that the user has chosen.
             least: Share of the evidence below which the claim is doubted, also without a rival.
         """
-        rival = max(claims, key=lambda one: one.evidence.share)
+        rival = max(claims, key=lambda one: (one.possible, one.evidence.share))
         held = next((one for one in claims if one.value == asked), claims[0])
-        if asked is None and rival.wins == "taken" and rival.evidence.beats(held.evidence):
+        if asked is None and rival.wins == "taken" and rival.beats(held):
             held = rival
         mine, other = held.evidence, rival.evidence
-        disputed = other.beats(mine)
+        disputed = rival.beats(held) and (held.possible or asked is None)
         parts = [f"{mine.share:.0%} of {mine.of:.0f} {things}"] if things and mine.of else []
         if disputed:
             parts.append(f"{other.share:.0%} {rival.text}" if things else rival.text)
         counted = ", ".join(parts)
-        weak = mine.share < HALF * other.share
-        if disputed and asked is None and rival.wins == "refused" and rival.sure and weak:
+        weak = mine.share < HALF * other.share or not held.possible
+        if asked is None and received and sum(one.possible for one in claims) != 1:
+            self.refuse(topic, expected, received, held.option)
+        elif disputed and asked is None and rival.wins == "refused" and rival.sure and weak:
             self.refuse(topic, expected, counted, rival.option)
         elif disputed or mine.bounds[1] < least:
             text = f"{clash}: {counted}" if clash else counted

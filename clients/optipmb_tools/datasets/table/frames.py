@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from optipmb_tools.datasets.motion import MOST_ALONE, REACH, SPEEDS, find_reports, kinds_apart, next_steps, overlapping
 from optipmb_tools.datasets.table.draft import Draft, Stamps
-from optipmb_tools.datasets.table.findings import NOISE, Reading
+from optipmb_tools.datasets.table.findings import NOISE, Claim, Reading
 from optipmb_tools.datasets.table.times import (
     DATED,
     LONGEST_GAP,
@@ -50,18 +50,23 @@ def reports(reading: Reading, draft: Draft) -> Draft:
     if not draft.scored or draft.pose is not None or "sensor" in draft.roles or draft.placed is not None:
         return draft
     found = find_reports(draft.series[row], draft.stamps.ns[row] / 1e9, draft.center[:, :2], draft.kind)
+    steps, times = next_steps(draft.series[row], draft.stamps.ns[row] / 1e9, draft.center[:, :2], draft.kind)
+    far = float(np.mean(steps > REACH[0] + SPEEDS[0] * times)) if len(steps) >= _MANY else 0.0
+    received = f"{far:.0%} of {len(steps)} boxes without one of their class within {SPEEDS[0]:g} m/s"
+    if far:
+        received += f": the nearest are {np.median(steps):.3g} m away after {np.median(times):.3g} s"
+    claims = [
+        Claim(
+            "frames",
+            option="--option time=UNIT, rate=HZ, length_factor=FACTOR; time=s keeps seconds",
+            possible=found is None and (far <= MOST_ALONE or bool({"time", "rate", "group"} & reading.options.keys())),
+        )
+    ]
     if found is not None:
         text = f"objects report one by one: a frame is a look at {found.distance:.3g} m around its box"
-        reading.doubt("time", text, "--option group=SECONDS joins them")
-        return replace(draft, reports=found)
-    steps, times = next_steps(draft.series[row], draft.stamps.ns[row] / 1e9, draft.center[:, :2], draft.kind)
-    far = steps > REACH[0] + SPEEDS[0] * times
-    if len(steps) >= _MANY and far.mean() > MOST_ALONE and not {"time", "rate", "group"} & reading.options.keys():
-        received = f"{far.mean():.0%} of {len(steps)} boxes without one of their class within {SPEEDS[0]:g} m/s"
-        received += f": the nearest are {np.median(steps):.3g} m away after {np.median(times):.3g} s"
-        how = "--option time=UNIT, rate=HZ, length_factor=FACTOR; time=s keeps seconds"
-        reading.refuse("time", "boxes that can be followed from frame to frame", received, how)
-    return draft
+        claims.append(Claim("reports", text=text, option="--option group=SECONDS joins them", wins="doubt"))
+    reading.decide("time", claims, expected="boxes that can be followed from frame to frame", received=received)
+    return replace(draft, reports=found)
 
 
 def _framed(reading: Reading, draft: Draft) -> Stamps:
@@ -89,18 +94,34 @@ def _framed(reading: Reading, draft: Draft) -> Stamps:
     parts = (name for name in draft.columns if name not in used and _is_name_of_few(draft, name))
     divider = next((name for name in parts if crowd(stamps.ns, draft.columns[name]) < NOISE), None)
     counts = at_places(stamps.ns, series)
-    received, option = f"{share:.0%} of the boxes at the place of another one of their stamp and class", ""
-    if divider is not None:
-        received, option = f"{received}, which differs in column {divider}", f"--option column.sensor={divider}"
-    elif share > CROWDED and may_be_merged(stamps.ns, series, float(np.median(counts[counts > 1]))):
-        received += ": stamps have lost digits, frames were merged, or two detectors see each object"
-        option = "--option time=UNIT, if the stamps are right"
-    else:
-        received += ": objects are reported twice, by two detectors or before suppression"
-    if option and share > CROWDED and "time" not in reading.options:
-        reading.refuse("time", "boxes apart from each other under one stamp", received, option)
-    else:
-        reading.doubt("rows", received, option)
+    crowded = share > CROWDED and "time" not in reading.options
+    merged = share > CROWDED and may_be_merged(stamps.ns, series, float(np.median(counts[counts > 1])))
+    received = f"{share:.0%} of the boxes at the place of another one of their stamp and class"
+    lost = "stamps have lost digits, frames were merged, or two detectors see each object"
+    claims = (
+        Claim("apart", possible=False),
+        Claim(
+            "sensors",
+            text=f"{received}, which differs in column {divider}",
+            option=f"--option column.sensor={divider}",
+            wins="refused" if crowded else "doubt",
+            possible=divider is not None,
+        ),
+        Claim(
+            "merged",
+            text=f"{received}: {lost}",
+            option="--option time=UNIT, if the stamps are right",
+            wins="refused" if crowded else "doubt",
+            possible=merged,
+        ),
+        Claim(
+            "twice",
+            text=f"{received}: objects are reported twice, by two detectors or before suppression",
+            wins="doubt",
+        ),
+    )
+    topic = "time" if crowded and (merged or divider is not None) else "rows"
+    reading.decide(topic, claims, expected="boxes apart from each other under one stamp")
     return stamps
 
 
@@ -113,9 +134,9 @@ def _check_times(reading: Reading, draft: Draft) -> None:
         return
     steps, times = next_steps(series[row], stamps.ns[row] / 1e9, draft.center[:, :2], draft.kind)
     speed = float(np.quantile(steps / times, 0.75)) if len(steps) else 0.0  # others may stand
-    if speed > SPEEDS[0]:
-        received = f"whole numbers that may be seconds; in milliseconds, boxes go at {speed:.3g} m/s"
-        reading.refuse("time", "a unit of time", received, "--option time=s, or time=ms")
+    text = f"whole numbers that may be seconds; in milliseconds, boxes go at {speed:.3g} m/s"
+    seconds = Claim("s", text=text, option="--option time=s, or time=ms", wins="refused")
+    reading.decide("time", (Claim("ms", possible=speed <= SPEEDS[0]), seconds), expected="a unit of time")
 
 
 def _is_name_of_few(draft: Draft, column: str) -> bool:
@@ -192,25 +213,21 @@ def read_frames(
     asked = reading.positive("group", "seconds", zero=True)
     if asked is not None:
         return of(group_stamps(stamps.ns, series, asked * 1e9, whole=True)) if asked else stamps
-    alone = crowd(stamps.ns)
+    most = max(0.5 * CROWDED, crowd(stamps.ns))
     by_number = None if number is None else rows_of_frames(stamps.ns, number, series)
-    for first, how in ((by_number, "number"), (frame_starts(stamps.ns, series), "step")):
-        if first is None:
-            continue
-        grouped = stamps.ns[first]
-        if crowd(grouped) > max(0.5 * CROWDED, alone):
-            if how == "number":
-                reading.doubt(
-                    "time",
-                    f"column {name} is not used: its frames hold boxes at one place",
-                    f"--option column.frame={name}",
-                )
-            continue
-        if how == "number":
-            reading.note("time", f"stamps differ within a frame: each has the first one of its {name}")
-        else:
-            apart, frames = (stamps.ns - grouped).max() / 1e9, len(np.unique(grouped))
-            text = f"stamps differ by up to {apart:.3g} s within a frame: grouped into {frames} frames"
-            reading.note("time", text, "--option group=SECONDS, 0 for none")
-        return of(first)
-    return stamps
+    by_step = frame_starts(stamps.ns, series)
+    claims, found = [Claim("stamp")], {"stamp": stamps}
+    if by_step is not None:
+        found["step"] = of(by_step)
+        apart, frames = (stamps.ns - found["step"].ns).max() / 1e9, len(np.unique(found["step"].ns))
+        text = f"stamps differ by up to {apart:.3g} s within a frame: grouped into {frames} frames"
+        possible = crowd(found["step"].ns) <= most
+        claims.insert(0, Claim("step", text=text, option="--option group=SECONDS, 0 for none", possible=possible))
+    if by_number is not None:
+        found["number"] = of(by_number)
+        text = f"stamps differ within a frame: each has the first one of its {name}"
+        claims.insert(0, Claim("number", text=text, possible=crowd(found["number"].ns) <= most))
+        if not claims[0].possible:
+            text = f"column {name} is not used: its frames hold boxes at one place"
+            reading.doubt("time", text, f"--option column.frame={name}")
+    return found[reading.decide("time", claims)]

@@ -163,8 +163,7 @@ def read_heading(
     usual = "y-clockwise" if way.compass else "x"
     stated = asked or ("radians" if unit == "quaternion" else ANGLE_UNITS.get(unit or ""))
     size = np.abs(values[np.isfinite(values)])
-    if stated is None and len(size) and np.mean(size > FULL_TURN) > FEW:
-        stated = "degrees"
+    radians = not len(size) or float(np.mean(size > FULL_TURN)) <= FEW
     moves = moves.take(np.isfinite(values[moves.start]))
     count = len(moves) if len(moves) >= ENOUGH_MOVES else 0
     sure = count >= REFUSED_MOVES and len(np.unique(moves.object)) > 1
@@ -177,8 +176,9 @@ def read_heading(
         return Evidence(float(both.sum()) * bool(count), count), Evidence(float(near.sum()) * bool(count), count)
 
     axis = zero or usual
-    claims = [Claim("radians", share("radians", axis)[0]), Claim("degrees", share("degrees", axis)[1])]
-    claims += [Claim("radians", share("radians", one)[0]) for one in HEADINGS]
+    claims = [Claim("radians", share("radians", axis)[0], possible=radians)]
+    claims += [Claim("degrees", share("degrees", axis)[1])]
+    claims += [Claim("radians", share("radians", one)[0], possible=radians) for one in HEADINGS]
     found = stated or reading.decide("yaw", claims)  # small degrees: all objects go forward in one direction
     text = "yaw is that of quaternions" if unit == "quaternion" else f"yaw is in {found}"
     text += ", clockwise from north as beside latitudes" if way.compass and zero is None else ""

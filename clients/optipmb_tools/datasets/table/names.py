@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from optipmb_tools.datasets.motion import are_people, find_moves, next_steps
 from optipmb_tools.datasets.table.draft import Draft
-from optipmb_tools.datasets.table.findings import HALF, Reading
+from optipmb_tools.datasets.table.findings import HALF, Claim, Reading
 from optipmb_tools.geometry import Ints
 from optipmb_tools.table_files import NO_VALUE, unique_texts
 
@@ -78,12 +78,14 @@ def people(reading: Reading, draft: Draft) -> Draft:
     row, xy = draft.row, draft.center[:, :2]
     frame = np.unique(draft.stamps.ns[row], return_inverse=True)[1] + draft.series[row] * len(row)
     steps, times = next_steps(draft.series[row], draft.stamps.ns[row] / 1e9, xy, draft.kind)
-    if not are_people(frame, xy, size, steps / times):
-        return draft
     what = "speeds and distances" if size is None else "sizes"
-    reading.note(
-        "class", f"boxes have the {what} of people: they are of class {_WALKING}", "--option class.object=NAME"
+    text = f"boxes have the {what} of people: they are of class {_WALKING}"
+    claims = (
+        Claim(NO_CLASS, possible=not are_people(frame, xy, size, steps / times)),
+        Claim(_WALKING, text=text, option="--option class.object=NAME"),
     )
+    if reading.decide("class", claims) == NO_CLASS:
+        return draft
     name = np.full(len(draft.name), _WALKING)
     return replace(draft, name=name, apart=(_WALKING,) if draft.apart else ())
 
@@ -162,11 +164,13 @@ def _without_numbers(reading: Reading, draft: Draft, names: NDArray[np.str_], pl
         frame = np.unique(draft.stamps.ns, return_inverse=True)[1]
         return int(np.unique(frame * len(values) + kind, return_counts=True)[1].max())
 
-    if most(names) > 1 or most(found) == 1:  # a class may have several boxes in a frame, an object has one
-        return names
     column = draft.roles["class"].name
-    reading.note("class", f"column {column} has classes and numbers of objects: {names[0]} is of class {found[0]}")
-    return found
+    text = f"column {column} has classes and numbers of objects: {names[0]} is of class {found[0]}"
+    claims = (  # a class may have several boxes in a frame, an object has one
+        Claim("classes", possible=most(names) > 1 or most(found) == 1),
+        Claim("objects", text=text),
+    )
+    return names if reading.decide("class", claims) == "classes" else found
 
 
 def _ids(draft: Draft, objects: NDArray[np.str_] | None) -> Ints | None:

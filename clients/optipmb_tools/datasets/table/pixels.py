@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from optipmb_schemas import FieldOfView
 
 from optipmb_tools.datasets.table.columns import normalised
-from optipmb_tools.datasets.table.findings import Reading
+from optipmb_tools.datasets.table.findings import Claim, Reading
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Floats, Ints, Pose, rotation_of, to_sensor, to_world
 
@@ -102,13 +102,17 @@ def place(
         raise DatasetError(reading.path, expected, f"the columns {', '.join(names)}")
     form, columns = found
     pixels = np.column_stack([numbers(name, name) for name in columns]) * (reading.positive("scale", "a factor") or 1.0)
-    if len(pixels) and not (pixels > _SHARES).any() and (pixels > 0.0).any():
-        reading.note("camera", "pixels are shares of the image, as all are up to 1", "--option scale=1")
-        pixels *= np.resize(camera.image, pixels.shape[1]) if "scale" not in reading.options else 1.0
-    if form == "xywh" and asked is None and [normalised(name).base for name in columns[:2]] == ["x", "y"]:
-        reading.doubt(
-            "camera", f"{columns[0]}, {columns[1]} are taken for the left upper corner", "--option box=xywh, cxcywh"
-        )
+    claims = (
+        Claim("pixels", possible=bool((pixels > _SHARES).any() or not (pixels > 0.0).any())),
+        Claim("shares", text="pixels are shares of the image, as all are up to 1", option="--option scale=1"),
+    )
+    if reading.decide("camera", claims, asked="pixels" if "scale" in reading.options else None) == "shares":
+        pixels *= np.resize(camera.image, pixels.shape[1])
+    if form == "xywh":
+        plain = [normalised(name).base for name in columns[:2]] == ["x", "y"]
+        text = f"{columns[0]}, {columns[1]} are taken for the left upper corner"
+        centre = Claim("cxcywh", text=text, option="--option box=xywh, cxcywh", wins="doubt", possible=plain)
+        reading.decide("camera", (Claim("xywh", possible=not plain), centre), asked=asked)
     if form == "cxcywh":
         pixels[:, :2] -= 0.5 * pixels[:, 2:]
     if form in {"xywh", "cxcywh"}:

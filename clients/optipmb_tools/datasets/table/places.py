@@ -12,7 +12,7 @@ from optipmb_tools.datasets.interface import georeference_of
 from optipmb_tools.datasets.table.angles import read_angle
 from optipmb_tools.datasets.table.columns import normalised
 from optipmb_tools.datasets.table.draft import Draft, column_numbers, leave_out, numbers
-from optipmb_tools.datasets.table.findings import Reading
+from optipmb_tools.datasets.table.findings import Claim, Reading
 from optipmb_tools.datasets.table.pixels import Placed, place
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Floats
@@ -131,17 +131,20 @@ def read_axes(reading: Reading, center: Floats) -> bool:
         DatasetError: The axes look like a camera's, and no option says so.
     """
     axes = reading.chosen("axes", ("z-up", "camera"))
-    if axes is None and len(center) > 1:
-        low, high = np.quantile(center, [0.05, 0.95], axis=0)
-        across, up = (high - low)[1:]
-        if up > SPREAD and up > 3.0 * across:
-            found = f"z from {low[2]:.3g} to {high[2]:.3g} m and y from {low[1]:.3g} to {high[1]:.3g} m"
-            expected = (
-                "z to point up (--option axes=z-up), or camera axes: x right, y down, z forward, y at the bottom of "
-                "the box, yaw about y as in KITTI"
-            )
-            reading.refuse("axes", expected, found, "--option axes=camera")
-    return axes == "camera"
+    if len(center) < 2:  # noqa: PLR2004  one box has no spread
+        return axes == "camera"
+    low, high = np.quantile(center, [0.05, 0.95], axis=0)
+    across, up = (high - low)[1:]
+    found = f"z from {low[2]:.3g} to {high[2]:.3g} m and y from {low[1]:.3g} to {high[1]:.3g} m"
+    expected = (
+        "z to point up (--option axes=z-up), or camera axes: x right, y down, z forward, y at the bottom of the box, "
+        "yaw about y as in KITTI"
+    )
+    claims = (
+        Claim("z-up", possible=up <= max(SPREAD, 3.0 * across)),
+        Claim("camera", text=found, option="--option axes=camera", wins="refused"),
+    )
+    return reading.decide("axes", claims, expected=expected, asked=axes) == "camera"
 
 
 def read_digits(reading: Reading, center: Floats) -> None:

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from optipmb_tools.datasets.table.draft import Draft, leave_out, numbers
-from optipmb_tools.datasets.table.findings import Reading
+from optipmb_tools.datasets.table.findings import Claim, Reading
 from optipmb_tools.geometry import Floats, Ints
 
 PERCENT: Final = 100.0
@@ -40,14 +40,21 @@ def read_scores(reading: Reading, scores: Floats, rows: Ints) -> Floats:
     rounded = (scores > 1.0) & (scores <= 1.0 + ROUNDING)
     outside = ((scores < 0.0) | (scores > 1.0)) & ~rounded
     low, high = float(scores.min(initial=0.0)), float(scores.max(initial=0.0))
-    if kind is None and float(np.mean(outside) if len(scores) else 0.0) > FEW:
-        kind = "percent" if low >= 0.0 and high > PERCENT / 4 else "logit"
-        if high > PERCENT or (kind == "logit" and max(high, -low) > LOGIT):
-            expected = "scores that are probabilities, percent or logits; scale them to 0 to 1"
-            reading.refuse("score", expected, f"scores from {low:.4g} to {high:.4g}")
-        taken = "divided by 100" if kind == "percent" else "taken through a sigmoid"
-        text = f"scores look like {'percent' if kind == 'percent' else 'logits'} ({low:.3g} to {high:.4g}): {taken}"
-        reading.note("score", text, "--option score=probability, logit, percent")
+    within = not len(scores) or float(np.mean(outside)) <= FEW
+    percent = not within and low >= 0.0 and PERCENT / 4 < high <= PERCENT
+    logit = not within and not percent and max(high, -low) <= LOGIT
+    seen, option = f"({low:.3g} to {high:.4g})", "--option score=probability, logit, percent"
+    claims = (
+        Claim("probability", possible=within),
+        Claim("percent", text=f"scores look like percent {seen}: divided by 100", option=option, possible=percent),
+        Claim("logit", text=f"scores look like logits {seen}: taken through a sigmoid", option=option, possible=logit),
+    )
+    kind = kind or reading.decide(
+        "score",
+        claims,
+        expected="scores that are probabilities, percent or logits; scale them to 0 to 1",
+        received=f"scores from {low:.4g} to {high:.4g}",
+    )
     if kind == "logit":
         return np.asarray(1.0 / (1.0 + np.exp(-np.clip(scores, -LOGIT, LOGIT))), dtype=np.float64)
     if kind == "percent":

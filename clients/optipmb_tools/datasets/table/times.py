@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from optipmb_tools.datasets.table.columns import UNITS, TableColumn
 from optipmb_tools.datasets.table.draft import Draft, Stamps, missing, numbers
-from optipmb_tools.datasets.table.findings import HALF, Reading
+from optipmb_tools.datasets.table.findings import HALF, Claim, Reading
 from optipmb_tools.geometry import Bools, Ints
 from optipmb_tools.table_files import NO_VALUE, is_number
 
@@ -141,25 +141,30 @@ def read_stamps(reading: Reading, numbers: np.ndarray, key: Ints, unit: str | No
     period = median_step(numbers if first is None else numbers[first], key)
     fitting = [name for name, size in SECONDS.items() if PERIODS[0] <= period * size <= PERIODS[1]]
     dated = [name for name, size in SECONDS.items() if DATED[0] <= float(numbers.max(initial=0)) * size <= DATED[1]]
-    stated, how = asked or unit, ""
-    if stated is None:
+    how = ""
+    if unit is None:
         both = [name for name in fitting if name in dated]
         counts = period == 1.0 and not dated and bool(np.all(numbers == np.round(numbers)))
-        found = both or fitting or dated or (["s"] if not period else [])
-        how = ", by their date" if both or not fitting else ""
-        if counts or len(found) != 1:
-            what = "whole numbers in steps of 1, which may count frames" if counts else f"steps of {period:g}"
-            reading.refuse("time", "a unit of time", what, "--option time=s, ms, us or ns, or rate=HZ")
-        stated = found[0] if found else "s"
-        if period * SECONDS[stated] > SLOWEST:
-            what = f"steps of {period:g}, which are {period * SECONDS[stated]:.3g} s in {_WORDS[stated]}"
-            reading.refuse("time", "frames at a plausible rate", what, "--option time=UNIT")
-    elif asked is None and period and not (0.2 * PERIODS[0] <= period * SECONDS[stated] <= 6.0 * PERIODS[1]):
-        for other in fitting[:1]:
-            expected = f"frames at a plausible rate: in {_WORDS[stated]}, as the column's name says, {period:g} apart"
-            reading.refuse(
-                "time", expected, f"steps that fit {_WORDS[other]}", f"--option time={other}, or time={stated}"
+        found = [] if counts else both or fitting or dated or (["s"] if not period else [])
+        how = ", by their date" if (both or not fitting) and asked is None else ""
+        option, expected = "--option time=s, ms, us or ns, or rate=HZ", "a unit of time"
+        claims = [Claim(one, option=option, possible=one in found) for one in SECONDS]
+        received = "whole numbers in steps of 1, which may count frames" if counts else f"steps of {period:g}"
+    else:
+        slow, fast = 6.0 * PERIODS[1], 0.2 * PERIODS[0]
+        expected = f"frames at a plausible rate: in {_WORDS[unit]}, as the column's name says, {period:g} apart"
+        claims = [Claim(unit, possible=not period or fast <= period * SECONDS[unit] <= slow)]
+        claims += [
+            Claim(
+                one, text=f"steps that fit {_WORDS[one]}", option=f"--option time={one}, or time={unit}", wins="refused"
             )
+            for one in fitting[:1]
+        ]
+        received = ""
+    stated = asked or reading.decide("time", claims, expected=expected, received=received)
+    if period * SECONDS[stated] > SLOWEST and not (asked or unit):
+        what = f"steps of {period:g}, which are {period * SECONDS[stated]:.3g} s in {_WORDS[stated]}"
+        reading.refuse("time", "frames at a plausible rate", what, "--option time=UNIT")
     rate = f"frames at {1.0 / (period * SECONDS[stated]):.3g} Hz" if period else "one stamp"
     reading.note("time", f"stamps are in {_WORDS[stated]}{how}: {rate}", "" if asked else "--option time=UNIT")
     return nanoseconds(reading, numbers, SECONDS[stated] * 1e9)
