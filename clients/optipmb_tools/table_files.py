@@ -235,7 +235,7 @@ def _text(path: Path, options: Mapping[str, str]) -> str:
     """Return the text of a file in the encoding that the user or its first bytes say; UTF-8 otherwise."""
     with _pyarrow().input_stream(path) as stream:
         data = bytes(stream.read())
-    expected = "text in UTF-8 (--option encoding=latin-1, cp1252 or utf-16-le reads others)"
+    expected = "text in UTF-8 (--option encoding=latin-1, cp1252, gbk or utf-16-le reads others)"
     return re.sub(r"\Asep=.(?=\n)", "", decode_text(path, data, expected, options.get("encoding")))
 
 

@@ -153,3 +153,100 @@ def test_check_draws_the_first_seconds(tmp_path: Path, capsys: pytest.CaptureFix
     with Image.open(tmp_path / "check.png") as picture:
         assert picture.size == (900, 700)
     assert "yaw" in done.stdout.rpartition("read as")[2]
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        {"t": "Zeit", "class": "Klasse", "l": "Länge", "w": "Breite", "h": "Höhe", "yaw": "Gierwinkel"},
+        {"t": "时间戳", "class": "类别", "l": "长", "w": "宽", "h": "高", "yaw": "航向角"},
+        {"x": "Position_1", "y": "Position_2", "z": "Position_3"},  # MATLAB counts from 1
+        {"t": "TIMESTAMP", "x": "UTM_X", "y": "UTM_Y", "yaw": "UTM_ANGLE"},
+        {"x": "pose.position.x", "y": "pose.position.y", "z": "pose.position.z"},
+    ],
+)
+def test_columns_by_names_of_other_sources(tmp_path: Path, names: dict[str, str]) -> None:
+    """German and Chinese names, lists that count from 1, map coordinates, and a pose where there is no other place."""
+    columns = street()
+    renamed = read(tmp_path / "a.csv", {names.get(name, name): one for name, one in columns.items()})[0]
+    plain = read(tmp_path / "b.csv", columns)[0]
+    for one, other in zip(renamed.frames(), plain.frames(), strict=True):
+        assert one.labels == other.labels
+        for name in ("center", "size", "yaw"):
+            assert np.array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_a_place_is_that_of_the_box(tmp_path: Path) -> None:
+    """Not a corner of its outline, which has the shorter name."""
+    columns = street()
+    outline = {"outline.polygon.0.x": columns["x"] + 2.0, "outline.polygon.0.y": columns["y"] + 1.0}
+    own = {f"position.{axis}": columns.pop(axis) for axis in "xyz"}
+    centre = next(iter(read(tmp_path / "a.csv", {**outline, **own, **columns})[0].frames())).center
+    assert np.allclose(centre[0], [one[0] for one in own.values()])
+
+
+@pytest.mark.parametrize("other", [{"object_category": 2}, {"type": "Feature"}])
+def test_classes_are_words_that_differ(tmp_path: Path, other: Table) -> None:
+    """Neither numbers nor a column with one word are the classes where another column has several words."""
+    columns = street()
+    names = np.where(columns["y"] > 0.0, "car", "truck")
+    more = {name: np.full(len(names), one) for name, one in other.items()}
+    rest = {name: one for name, one in columns.items() if name != "class"}
+    sequence = read(tmp_path / "a.csv", {**more, "properties.class": names, **rest})[0]
+    assert set(sequence.labels) == {"car", "truck"}
+
+
+def test_rows_that_stand_for_no_object(tmp_path: Path) -> None:
+    """Rows at 0, 0 that fill a frame up are left out; rows at -1, -1 are doubted, with the option for them."""
+    columns = street()
+    plain = read(tmp_path / "a.csv", columns)[0]
+    empty = {name: one[:0] for name, one in columns.items()}
+    empty |= {name: np.zeros(2 * len(plain)) for name in ("x", "y", "z", "l", "w", "h", "yaw", "score")}
+    empty |= {"t": np.repeat(plain.times, 2), "class": np.full(2 * len(plain), "car")}
+    filled = {name: np.concatenate([one, empty[name]]) for name, one in columns.items()}
+    sequence, found = read(tmp_path / "b.csv", filled)
+    assert [len(one) for one in sequence.frames()] == [len(one) for one in plain.frames()]
+    assert any("240 rows at 0, 0" in one.text for one in found)
+    columns["x"][::9], columns["y"][::9] = -1.0, -1.0
+    assert any(one.doubt and "missing=-1" in one.option for one in read(tmp_path / "c.csv", columns)[1])
+
+
+def test_a_class_without_sizes_has_none(tmp_path: Path) -> None:
+    """Empty sizes of most boxes of a class are unknown; a single one is missing, and refused with its line."""
+    columns = street()
+    people = columns["y"] > 0.0
+    columns["class"] = np.where(people, "pedestrian", "car")
+    columns["l"][people], columns["w"][people] = np.nan, np.nan
+    sequence, _ = read(tmp_path / "a.csv", columns)
+    size = np.concatenate([frame.size for frame in sequence.frames()])
+    assert np.isnan(size[:, 0]).sum() == people.sum()
+    columns["l"][int(np.flatnonzero(~people)[3])] = np.nan
+    with pytest.raises(DatasetError, match="positive length"):
+        read(tmp_path / "b.csv", columns)
+
+
+def test_feet_and_small_degrees_are_named(tmp_path: Path) -> None:
+    """Sizes of cars in feet are doubted by any name of their class; coordinates in 1e-7 degrees are read."""
+    columns = street()
+    feet = {name: columns[name] / 0.3048 for name in "xyzlwh"} | {"class": np.full(len(columns["t"]), 2)}
+    assert any(one.doubt and "as feet" in one.text for one in read(tmp_path / "a.csv", columns | feet)[1])
+    places = {"lat": 48.0 + columns.pop("y") / 111_200.0, "lon": 11.0 + columns.pop("x") / 74_600.0}
+    whole = {name: np.round(1e7 * one).astype(np.int64) for name, one in places.items()}
+    one, other = (read(tmp_path / "b.csv", columns | given, origin="48,11,0")[0] for given in (places, whole))
+    for a, b in zip(one.frames(), other.frames(), strict=True):
+        assert np.allclose(a.center, b.center, atol=0.02)
+
+
+def test_marks_among_headings_and_objects_side_by_side(tmp_path: Path) -> None:
+    """AIS has 511 for no heading, and then its course; a row for all objects is refused, as one alone would be read."""
+    columns = street()
+    course = np.degrees(0.5 * np.pi - columns.pop("yaw")) % 360.0
+    marked = columns | {"heading": np.full(len(course), 511.0), "cog": course}
+    sequence = read(tmp_path / "a.csv", marked, heading="y-clockwise")[0]
+    assert np.allclose(np.cos(next(iter(sequence.frames())).yaw - street()["yaw"][:8]), 1.0, atol=1e-3)
+    some = np.where(np.arange(len(course)) % 3 == 0, 511.0, course)
+    found = read(tmp_path / "b.csv", columns | {"heading": some}, heading="y-clockwise")[1]
+    assert any("a heading of 511" in one.text for one in found)
+    wide = {"t": columns["t"][::8], **{f"{axis}_{k}": columns[axis][k::8] for k in range(1, 4) for axis in "xy"}}
+    with pytest.raises(DatasetError, match="a row for each box"):
+        read(tmp_path / "c.csv", wide)

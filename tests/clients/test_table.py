@@ -121,10 +121,10 @@ def test_names_of_columns_are_many(tmp_path: Path) -> None:
     notes, sequence = notes_and_frames(tmp_path / "a.csv", other)
     assert "columns not used: weather" in notes
     same(sequence, only(TableDataset(table(tmp_path / "b.csv", plain))))
-    east = {name: values for name, values in {**plain, "east": plain["x"]}.items() if name != "x"}
-    with pytest.raises(DatasetError, match=r"a column x \(--option column.x=east\)"):
+    east = {name: values for name, values in {**plain, "pos_east": plain["x"]}.items() if name != "x"}
+    with pytest.raises(DatasetError, match=r"a column x \(--option column.x=pos_east\)"):
         notes_and_frames(tmp_path / "c.csv", east)
-    same(notes_and_frames(tmp_path / "d.csv", east, **{"column.x": "east"})[1], sequence)
+    same(notes_and_frames(tmp_path / "d.csv", east, **{"column.x": "pos_east"})[1], sequence)
     for before in ("det_", "bbox3d_", "object_"):
         named = {"timeStamp": plain["t"], **{before + name: one for name, one in plain.items() if name != "t"}}
         same(notes_and_frames(tmp_path / f"{before}.csv", named)[1], sequence)

@@ -138,7 +138,7 @@ def test_the_day_is_found_where_a_number_exceeds_twelve(tmp_path: Path) -> None:
         ("d.csv", "t,x\n2024-05-01 10:00:00.1,1\n2024-05-01 10:00,2\nsoon,3\n", {}, ":4: expected a date as YYYY"),
         ("d.jsonl", '{"t": "2024-05-01T10:00:00.1Z"}\n{"t": "2024-05-01T10:00:00.2"}\n', {}, ":2: expected a date as"),
         ("d.csv", b"t,class\n1,Fu\xdf\n", {}, ":2: expected text in UTF-8 (--option encoding=latin-1"),
-        ("d.csv", "t,x\n1,2\n".encode("utf-16-le"), {}, "--option encoding=latin-1, cp1252 or utf-16-le"),
+        ("d.csv", "t,x\n1,2\n".encode("utf-16-le"), {}, "--option encoding=latin-1, cp1252, gbk or utf-16-le"),
         ("d.csv", "t,x\n", {"encoding": "klingon"}, "--option encoding: expected latin-1"),
         (
             "d.csv",

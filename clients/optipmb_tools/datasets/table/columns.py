@@ -7,7 +7,7 @@ meaning only in a reading that uses the whole group.
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from optipmb_tools.table_files import BOX_LISTS
@@ -20,6 +20,7 @@ class TableColumn:
     name: str  # as the table has it
     unit: str | None  # in its name: `deg`, `rad`, `s`, `ms`, `us`, `ns`
     base: str  # its name without the unit, normalised
+    depth: int = 0  # groups around it that its name does without
 
 
 def _vector(bases: str, part: str, place: int) -> tuple[str, ...]:
@@ -32,8 +33,10 @@ def _vector(bases: str, part: str, place: int) -> tuple[str, ...]:
 _CENTER: Final = "center centre centroid pos position loc location translation 3d_location xyz c p t bbox box"
 _SIZE: Final = "size dim dims dimension dimensions extent extents 3d_dimensions scale lwh box_size"
 _SPEED: Final = "v vel velocity speed"
-_POSE_NAMES: Final = "pose ego sensor_pose ego_pose ego_translation pose_translation ego_position sensor_position"
-_TURN: Final = "pose ego sensor_pose ego_pose ego_rotation pose_rotation"
+_POSE_NAMES: Final = (
+    "pose ego sensor_pose ego_pose ego_translation pose_translation ego_position sensor_position pose_position"
+)
+_TURN: Final = "pose ego sensor_pose ego_pose ego_rotation pose_rotation pose_orientation"
 _BOX_TURN: Final = "q quat quaternion rotation rotations rot orientation"
 
 
@@ -52,23 +55,26 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
               "header_stamp", "header_timestamp", "time_stamp", "frame_time", "frame_timestamp", "frame_stamp",
               "date_time", "unix_time", "unix_timestamp", "epoch_time", "utc_time", "utc", "capture_time", "scan_time",
               "lidar_timestamp", "lidar_time", "sensor_timestamp", "sensor_time", "measurement_time", "gps_time",
-              "base_date_time", "global_time", "timestep_time", "time_of_day", "posix_time", "position_time"),
+              "base_date_time", "global_time", "timestep_time", "time_of_day", "posix_time", "position_time",
+              "sample_timestamp", "unixtime", "frame_ts"),
     "nanosec": ("nanosec", "nanosecs", "nsec", "nsecs", "nanoseconds"),
     "frame": ("frame", "frame_id", "frame_index", "frame_idx", "frame_number", "frame_no", "frame_nr",
               "frame_num", "frame_count", "frame_counter", "scan_id", "scan_index", "scan_idx", "scan_number",
               "sweep_id", "timestep", "time_step", "sample_idx", "sample_index", "image_id", "img_id"),
-    "x": ("x", "cx", "xc", "px", "x_center", "x_centre", "tx", "easting", "local_x", *_vector(_CENTER, "x", 0)),
-    "y": ("y", "cy", "yc", "py", "y_center", "y_centre", "ty", "northing", "local_y", *_vector(_CENTER, "y", 1)),
+    "x": ("x", "cx", "xc", "px", "x_center", "x_centre", "tx", "easting", "east", "local_x", "world_x", "x_world",
+          "map_x", "x_map", "utm_x", "utm_e", "utm_easting", "x_utm", *_vector(_CENTER, "x", 0)),
+    "y": ("y", "cy", "yc", "py", "y_center", "y_centre", "ty", "northing", "north", "local_y", "world_y", "y_world",
+          "map_y", "y_map", "utm_y", "utm_n", "utm_northing", "y_utm", *_vector(_CENTER, "y", 1)),
     "z": ("z", "cz", "zc", "pz", "z_center", "z_centre", "tz", *_vector(_CENTER, "z", 2)),
-    "lat": ("lat", "latitude"),
-    "lon": ("lon", "lng", "longitude"),
-    "alt": ("alt", "altitude"),
+    "lat": ("lat", "latitude", "geometry_coordinates_1"),
+    "lon": ("lon", "lng", "longitude", "geometry_coordinates_0"),
+    "alt": ("alt", "altitude", "geometry_coordinates_2"),
     "l": ("l", "length", "box_length", "dx", *_extent("x", "l", "length", 0)),
     "w": ("w", "width", "box_width", "dy", *_extent("y", "w", "width", 1)),
     "h": ("h", "height", "box_height", "dz", *_extent("z", "h", "height", 2)),
     "yaw": ("yaw", "heading", "theta", "yaw_angle", "heading_angle", "rotation_z", "rot_z", "rz", "rotation_y", "ry",
             "rot", "rotation", "orientation", "rotation_yaw", "rot_yaw", "orientation_yaw", "euler_yaw",
-            "rpy_yaw", "yaw_of_corners", "psi", *BEARINGS),
+            "rpy_yaw", "yaw_of_corners", "psi", "utm_angle", *BEARINGS),
     "qw": ("qw", "q0", *_vector(_BOX_TURN, "w", 0)),
     "qx": ("qx", "q1", *_vector(_BOX_TURN, "x", 1)),
     "qy": ("qy", "q2", *_vector(_BOX_TURN, "y", 2)),
@@ -85,7 +91,7 @@ ALIASES: Final[Mapping[str, tuple[str, ...]]] = {
     "cov_xx": ("cov_xx", "cov_x_x", "covariance_xx", "covariance_x_x", "var_x", "variance_x", "x_var", "x_variance"),
     "cov_xy": ("cov_xy", "cov_x_y", "covariance_xy", "covariance_x_y"),
     "cov_yy": ("cov_yy", "cov_y_y", "covariance_yy", "covariance_y_y", "var_y", "variance_y", "y_var", "y_variance"),
-    "id": ("id", "track_id", "object_id", "obj_id", "tracking_id", "instance_id", "instance",
+    "id": ("id", "track_id", "object_id", "obj_id", "objid", "tracking_id", "instance_id", "instance",
            "instance_token", "track", "track_uuid", "object_uuid", "instance_uuid", "uuid", "track_label", "agent_id",
            "actor_id", "person_id", "player_id", "target_id", "mmsi", "icao24"),
     "recording": ("recording", "recording_id", "sequence", "sequence_id", "sequence_name", "scene", "scene_name",
@@ -111,9 +117,10 @@ UNITS: Final[Mapping[str, str]] = {
 }  # fmt: skip
 _WORDS: Final = {"stamp", "class", "id", "recording", "sensor"}  # meanings whose values may be words
 _WORDS_OF: Final = {
-    "stamp": "time|stamp|timestamp|datetime|date|clock|epoch|nanos|micros|millis|nsec|usec|msec",
+    "stamp": "time|stamp|timestamp|ts|datetime|date|clock|epoch|nanos|micros|millis|nsec|usec|msec",
     "frame": "frame|scan|sweep|step|image|index",
-    "x": "x|xc|x0|lon|longitude|east|easting|utm_x|utm_e", "y": "y|yc|y0|lat|latitude|north|northing|utm_y|utm_n",
+    "x": "x|xc|x0|lon|longitude|long|longitudinal|east|easting|utm_x|utm_e",
+    "y": "y|yc|y0|lat|latitude|lateral|north|northing|utm_y|utm_n",
     "l": "l|len|length|long|size|dims?|dimensions?|extents?", "w": "w|width|wide|beam|size|dims?|dimensions?|extents?",
     "class": "class|classes|type|category|categories|label|labels|kind|species|subtype|classification",
     "id": "id|uid|uuid|guid|token|mmsi|imo|icao|callsign|track",
@@ -133,10 +140,27 @@ _LEADING: Final = re.compile(
 )
 """Word before the name of a column that only says what the column is of."""
 _GROUP_OF: Final = (("size", "size|dims?|dimensions?|extents?"), ("velocity", "vel|velocity|twist|speed"))
-_NO_PLACE: Final = "acc|accel|acceleration|force|jerk|angular|std|sigma|var|cov|covariance|error|offset|gyro|imu"
+_NO_PLACE: Final = (
+    "acc|accel|acceleration|force|jerk|angular|std|sigma|var|cov|covariance|error|offset|gyro|imu|"
+    "polygon|vertex|vertices|contour|hull|footprint"
+)
 """Words of groups whose members x, y, z are no places."""
 _OTHER: Final = re.compile("ego|pose|sensor|camera|lidar|vehicle|header")  # groups that describe no box
 _LENGTHS: Final = {"m", "meter", "meters", "metre", "metres", "mps"}
+_TRANSLATED: Final[Mapping[str, str]] = {
+    name: word
+    for word, names in {
+        "time": "zeit zeitstempel uhrzeit datum temps horodatage 时间 时间戳", "frame": "bild bildnummer 帧 帧号 帧id",
+        "class": "klasse typ objekttyp objektklasse classe 类别 类型 目标类型 目标类别",
+        "id": "objekt_id objekt objektnummer 目标id 目标编号 编号 id号",
+        "length": "länge laenge longueur 长 长度", "width": "breite largeur 宽 宽度",
+        "height": "höhe hoehe hauteur 高 高度",
+        "yaw": "gierwinkel winkel orientierung cap 航向角 航向 朝向 偏航角", "score": "konfidenz 置信度 得分",
+        "lat": "breitengrad 纬度", "lon": "längengrad laengengrad 经度", "x": "x坐标", "y": "y坐标", "z": "z坐标",
+    }.items()
+    for name in names.split()
+}  # fmt: skip
+"""Standard names of columns for those in German, French and Chinese."""
 FACTORS: Final[Mapping[str, float]] = {
     "cm": 0.01, "mm": 0.001, "km": 1000.0, "ft": 0.3048, "feet": 0.3048, "kmh": 1.0 / 3.6, "kph": 1.0 / 3.6,
     "mph": 0.44704,
@@ -154,7 +178,7 @@ def find_columns(
         chosen: Meanings whose column the user has named.
         texts: Columns without any number, which hold no quantities under any name.
     """
-    known = [normalised(name) for name in names]
+    known = normalised_all(names)
     taken: dict[str, TableColumn] = {}
     used = set(chosen.values())
     for role in ALIASES:
@@ -184,7 +208,8 @@ def find_columns(
                 TableColumn(one.name, "ns", aliases[0]) for one in parts if one.base in bases or one.base in aliases
             ]
         if fitting:
-            best = min(fitting, key=lambda one: (aliases.index(one.base), _is_second_half(one), len(one.name)))
+            order = {one: (one.depth, aliases.index(one.base), _is_second_half(one), len(one.name)) for one in fitting}
+            best = min(fitting, key=order.__getitem__)
             taken[role] = best
             used.add(best.name)
     return taken
@@ -226,7 +251,7 @@ def _is_second_half(column: TableColumn) -> bool:
 
 def _plain(name: str) -> str:
     words = re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", re.sub(r"3D(?![a-z])", "3d", name))
-    return re.sub(r"[^a-z0-9]+", "_", words.lower()).strip("_")
+    return re.sub(r"[\W_]+", "_", words.lower()).strip("_")
 
 
 def normalised(name: str) -> TableColumn:
@@ -242,9 +267,26 @@ def normalised(name: str) -> TableColumn:
         if _known(last) and not re.search(f"_({_NO_PLACE})(_?[23]d)?_", group):
             of = (kind for kind, words in _GROUP_OF if re.search(f"_({words})(_?[23]d)?_", group))
             named = f"{next(of, '')}_{last}".strip("_")
-            return TableColumn(name, last_unit, named if _known(named) else last)
+            return TableColumn(name, last_unit, named if _known(named) else last, start)
     rest = _LEADING.sub("", base, count=1)
     return TableColumn(name, unit, base if _known(base) or not _known(rest) else rest)
+
+
+def normalised_all(names: Iterable[str]) -> list[TableColumn]:
+    """Return columns by their names; the numbers of a list that count from 1 count from 0."""
+    known = [normalised(name) for name in names]
+    lists: dict[str, set[str]] = {}
+    for one in known:
+        stem, _, number = one.base.rpartition("_")
+        if number.isdigit():
+            lists.setdefault(stem, set()).add(number)
+    from_one = {stem for stem, numbers in lists.items() if {"1", "2"} <= numbers and "0" not in numbers}
+    return [
+        replace(one, base=f"{stem}_{int(number) - 1}")
+        if (stem := one.base.rpartition("_")[0]) in from_one and (number := one.base.rpartition("_")[2]).isdigit()
+        else one
+        for one in known
+    ]
 
 
 def _known(base: str) -> bool:
@@ -253,6 +295,7 @@ def _known(base: str) -> bool:
 
 def _base(name: str) -> tuple[str, str | None]:
     base = re.sub("_km_h$", "_kmh", _plain(name)).removesuffix("_m_s")
+    base = _TRANSLATED.get(base, base)
     head, _, tail = base.rpartition("_")
     if head and tail in FACTORS:
         return head, tail

@@ -1,5 +1,6 @@
 """State of the reading of a table, which each step extends."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
@@ -162,12 +163,19 @@ def missing(reading: Reading, draft: Draft, role: str) -> DatasetError:
     unused = draft.columns.keys() - {one.name for one in draft.roles.values()}
     likely = {one: [name for name in candidates(draft.columns, one) if name in unused] for one in lacks}
     option = " ".join(f"--option column.{one}={'NAME' if not names else names[0]}" for one, names in likely.items())
+    if role == "pose_yaw":
+        option += ", or column.pose_x=none where boxes are in the world"
     expected = f"{'a column' if len(lacks) == 1 else 'columns'} {', '.join(lacks)} ({option})"
     if "stamp" in lacks:
         option = option.replace("--option column.stamp=NAME", "t, stamp_ns …; --option column.stamp=NAME")
         others = f", and columns {', '.join(lacks[1:])}" if len(lacks) > 1 else ""
         expected = f"a column of stamps ({option}) or of frames{others}"
     have = [*draft.columns]
+    beside = {re.sub(r"\d+", "#", name) for names in likely.values() for name in names if re.search(r"\d", name)}
+    sets = [name for names in likely.values() for name in names if re.sub(r"\d+", "#", name) in beside]
+    if len(sets) > len(likely) * 2 and "stamp" not in lacks:  # such a column has one of the objects alone
+        expected = f"a row for each box, with columns {', '.join(lacks)}, instead of objects side by side"
+        return DatasetError(reading.path, expected, f"the columns {', '.join(sets[:_MOST_NAMED])}")
     more = f" and {len(have) - _MOST_NAMED} more" if len(have) > _MOST_NAMED else ""
     return DatasetError(reading.path, expected, f"the columns {', '.join(have[:_MOST_NAMED])}{more}")
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from optipmb_tools.datasets.evidence import Evidence
 from optipmb_tools.datasets.motion import LEAST_ALONG, MOST, SAME_DIRECTION, Moves
-from optipmb_tools.datasets.table.angles import ANGLE_UNITS, FULL_TURN, read_quaternion
+from optipmb_tools.datasets.table.angles import ANGLE_UNITS, FULL_TURN, no_angle, read_quaternion
 from optipmb_tools.datasets.table.columns import BEARINGS, TableColumn, normalised, turned
 from optipmb_tools.datasets.table.corners import CORNERED
 from optipmb_tools.datasets.table.draft import Draft, column_numbers, numbers
@@ -55,11 +55,17 @@ class _Way:
 def step(reading: Reading, draft: Draft) -> Draft:
     """Read the headings as the table has them."""
     yaw, unit = _yaw(reading, draft)
+    beyond = no_angle(reading, yaw, unit)
+    marks = np.unique(yaw[beyond])
+    if len(marks) == 1 and beyond.sum() > 1 and unit != "none":
+        reading.note("yaw", f"a heading of {marks[0]:g} in {int(beyond.sum())} rows is none: it is unknown")
+        yaw = np.where(beyond, np.nan, yaw)
     missing = ["the size"] * draft.centres + ["the heading"] * (unit == "none")
     if missing:
         meaning = "unknown" if draft.scored else "only centres can be compared"
         reading.note("sizes", f"no column for {' or '.join(missing)}: {meaning}")
-    if unit == "none" and (others := turned(draft.columns)):
+    used = {one.name for one in draft.roles.values()}
+    if unit == "none" and (others := turned(name for name in draft.columns if name not in used)):
         text = f"the heading is unknown, though {', '.join(others[:_MOST_SHOWN])} may have it"
         reading.doubt("yaw", text, "--option column.yaw=NAME, or none")
     return replace(draft, yaw=yaw, yaw_unit=unit)

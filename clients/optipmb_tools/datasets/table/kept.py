@@ -26,6 +26,8 @@ def step(reading: Reading, draft: Draft) -> Draft:
     empty = np.isnan(draft.center[:, :2]).all(axis=1) & (draft.centres | np.isnan(draft.size[:, :2]).all(axis=1))
     kept = np.asarray(~(empty | draft.stamps.skipped))
     if draft.scored:
+        kept = leave_out(reading, kept, _slots(reading, draft), "at 0, 0 of a list that is not full")
+    if draft.scored:
         kept = leave_out(reading, kept, _doubled(draft), "that another one repeats")
     read = {draft.roles[role].name: np.empty(0) for role in _READ if role in draft.roles}
     return replace(draft, columns=draft.columns | read, kept=_valid(reading, draft, kept))
@@ -39,6 +41,17 @@ def boxes(reading: Reading, draft: Draft) -> Draft:
     if len(row) < draft.rows:
         arrays = {name: None if one is None else one[row] for name, one in arrays.items()}
     return replace(draft, row=row, **arrays)
+
+
+def _slots(reading: Reading, draft: Draft) -> Bools:
+    """Return the rows at 0, 0 without a size, of which some frame has several: no two things are at one place."""
+    zero = (draft.center[:, :2] == 0.0).all(axis=1) & (draft.unsized | draft.centres)
+    frame = np.unique(np.column_stack([draft.series, draft.stamps.ns])[zero], axis=0, return_counts=True)[1]
+    mark = (draft.center[:, :2] == -1.0).all(axis=1)
+    if 1 < mark.sum() < len(mark):
+        text = f"{int(mark.sum())} rows are at -1, -1, as a mark for no place"
+        reading.doubt("rows", text, "--option missing=-1 invalid=skip")
+    return np.asarray(zero & bool((frame > 1).any()), dtype=np.bool_)
 
 
 def _doubled(draft: Draft) -> Bools:

@@ -23,6 +23,7 @@ _PIXELS: Final = re.compile(
 )
 SPREAD: Final = 8.0
 SINGLE: Final = 0.1
+_POLE: Final = 90.0
 FAR: Final = 1e5  # coordinates in metres beyond which single precision loses centimetres
 LEAST_VARIANCE: Final = 1e-8
 LARGEST_VARIANCE: Final = 1e8  # variances of a position along any axis, m^2, as `Detections` have them
@@ -59,7 +60,16 @@ def _centers(reading: Reading, draft: Draft) -> Floats:
         ends = (("x", None), ("y", None), ("z", 0.0))
         return np.column_stack([numbers(reading, draft, role, without) for role, without in ends])
     alt = numbers(reading, draft, "alt") if draft.height == "alt" else None
-    center = georeference_of(origin).to_world(numbers(reading, draft, "lat"), numbers(reading, draft, "lon"), alt)
+    lat, lon = numbers(reading, draft, "lat"), numbers(reading, draft, "lon")
+    most = float(np.nanmax(np.abs(lat), initial=0.0))
+    claims = (
+        Claim("degrees", possible=most <= _POLE),
+        Claim("1e-7", text="latitudes and longitudes are in 1e-7 degrees", possible=1e5 * _POLE < most <= 1e7 * _POLE),
+    )
+    received = f"up to {most:.9g} in column {found['lat'].name}"
+    unit = reading.decide("position", claims, expected="latitudes in degrees, or in 1e-7 degrees", received=received)
+    lat, lon = (lat, lon) if unit == "degrees" else (1e-7 * lat, 1e-7 * lon)
+    center = georeference_of(origin).to_world(lat, lon, alt)
     if alt is None:
         center[:, 2] = numbers(reading, draft, "z", 0.0)
     return center
@@ -144,7 +154,7 @@ def read_axes(reading: Reading, center: Floats) -> bool:
         Claim("z-up", possible=up <= max(SPREAD, 3.0 * across)),
         Claim("camera", text=found, option="--option axes=camera", wins="refused"),
     )
-    return reading.decide("axes", claims, expected=expected, asked=axes) == "camera"
+    return (axes or reading.decide("axes", claims, expected=expected)) == "camera"
 
 
 def read_digits(reading: Reading, center: Floats) -> None:

@@ -1,13 +1,14 @@
 """Meanings of the columns of a table: by names and values, by corners, and numbers in names."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from optipmb_tools.datasets.table.angles import LARGEST_DEGREES
 from optipmb_tools.datasets.table.columns import (
     ALIASES,
     NOTHING,
@@ -15,6 +16,7 @@ from optipmb_tools.datasets.table.columns import (
     candidates,
     find_columns,
     normalised,
+    normalised_all,
     turn_of,
 )
 from optipmb_tools.datasets.table.corners import with_boxes
@@ -24,6 +26,7 @@ from optipmb_tools.datasets.table.pixels import METRES
 from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, is_number, unique_texts
 
 _MOST_SHOWN: Final = 6
+_NO_COLUMN: Final = TableColumn("", None, "")
 _NEEDED: Final = ("x", "y", "lat", "lon", "l", "w")  # with texts they are refused where a text stands
 _MATRICES: Final = (12, 16)  # numbers of a pose
 _FEW_CLASSES: Final = 64
@@ -46,7 +49,7 @@ def step(reading: Reading, draft: Draft) -> Draft:
         used = {one.column for one in rows}
         rows += [Understood("", name, "", first[name]) for name in boxes if name not in used]
         reading.understood += [one for one in rows if one not in reading.understood]
-    kind, members = (None if "yaw" in roles else turn_of(map(normalised, boxes))) or ("", [])
+    kind, members = (None if "yaw" in roles else turn_of(normalised_all(boxes))) or ("", [])
     return replace(draft, columns=boxes, roles=roles, turn_of=kind, turn_columns=tuple(members))
 
 
@@ -60,6 +63,7 @@ def find(reading: Reading, columns: Columns) -> dict[str, TableColumn]:
     taken = {role: name for role, name in chosen.items() if name in columns or name == NOTHING}
     words = {name for name, one in columns.items() if _has_no_number(one)}
     empty = {name for name, one in columns.items() if one.dtype.kind == "f" and len(one) and np.isnan(one).all()}
+    empty |= {name for name, one in columns.items() if normalised(name).base in ALIASES["yaw"] and _is_no_angle(one)}
     found = find_columns([name for name in columns if name not in empty], taken, words)
     if empty:
         found = {role: one for role, one in find_columns(columns, taken, words).items() if role not in _SPARED} | found
@@ -67,21 +71,51 @@ def find(reading: Reading, columns: Columns) -> dict[str, TableColumn]:
     for role, one in find_columns(columns, taken).items():  # refused when it is read, as a number is expected
         if role not in found and one.name in words - used and (role in _NEEDED or _has_units(columns[one.name])):
             found[role] = one
+    found = _by_others(columns, found, chosen)
+    if "class" not in chosen and (kind := _class_column(columns, found, words)) is not None:
+        found["class"] = kind
+    return found
+
+
+def _by_others(columns: Columns, found: dict[str, TableColumn], chosen: Mapping[str, str]) -> dict[str, TableColumn]:
+    """Return the columns with those whose meaning follows from what else there is."""
+    dates = [name for name, one in columns.items() if one.dtype.kind == "M"]
+    if len(dates) == 1 and not {"stamp", "frame"} & found.keys():
+        found["stamp"] = TableColumn(dates[0], None, "")
     cells = [
         name for name in columns if re.fullmatch(r"(.*[._])?(ego|sensor|lidar)?_?pose(_matrix)?[._]\d[._]\d", name)
     ]
     if "pose_x" not in found and len(cells) in _MATRICES:  # a matrix by rows, which `poses` reads as a whole
         found |= {role: TableColumn(name, None, "") for role, name in zip(("pose_x", "pose_y"), cells, strict=False)}
+    if not {"x", "lat"} & {*found, *chosen} and found.get("pose_x", _NO_COLUMN).base.startswith("pose"):
+        found = {role.removeprefix("pose_"): one for role, one in found.items()}  # of the box, as no other place is
     track = found.get("id")
     over_ground = track is not None and track.base == "track" and columns[track.name].dtype.kind == "f"
     if track is not None and over_ground and {"lat", "lon"} <= found.keys() and "yaw" not in found:
         found["yaw"] = replace(found.pop("id"), base="true_track")
-    if "class" not in found and chosen.get("class") != NOTHING:
-        named = [name for name in candidates(columns, "class") if name in words - used]
-        few = [name for name in named if len(unique_texts(columns[name])[0]) <= _FEW_CLASSES]
-        if len(few) == 1:
-            found["class"] = TableColumn(few[0], None, "")
     return found
+
+
+def _class_column(columns: Columns, found: Mapping[str, TableColumn], words: Collection[str]) -> TableColumn | None:
+    """Return the column of classes: with words rather than numbers, and with several rather than one."""
+    held = found.get("class")
+    worded = held is not None and columns[held.name].dtype.kind == "U"
+    if held is not None and worded and len(unique_texts(columns[held.name])[0]) > 1:
+        return held
+    used = {one.name for one in found.values()}
+    texts = {name: unique_texts(columns[name])[0].tolist() for name in words if name not in used}
+    few = {name: one for name, one in texts.items() if len(one) <= _FEW_CLASSES}
+    order = {
+        one: (len(few[one.name]) == 1, one.depth, ALIASES["class"].index(one.base))
+        for one in map(normalised, few)
+        if one.base in ALIASES["class"]
+        and len(few[one.name]) > worded
+        and not all(map(re.compile(r"\d").search, few[one.name]))  # names of objects
+    }
+    if held is None and not order:
+        likely = [name for name in candidates(columns, "class") if name in few]
+        return TableColumn(likely[0], None, "") if len(likely) == 1 else None
+    return min(order, key=order.__getitem__, default=held)
 
 
 def note(reading: Reading, draft: Draft) -> Draft:
@@ -125,6 +159,11 @@ def _with_frame_numbers(reading: Reading, columns: Columns, found: Mapping[str, 
             kind, numbers = frame_numbers([reading.path / text for text in texts.tolist()])
             return columns | {name if kind == "frame" else kind: np.array(numbers)[place]}
     return columns
+
+
+def _is_no_angle(values: NDArray[Any]) -> bool:
+    """Tell whether all numbers of a column are beyond any angle, as one that has marks for no value alone."""
+    return values.dtype.kind in "if" and len(values) > 0 and bool((np.abs(values) > LARGEST_DEGREES).all())
 
 
 def _has_units(texts: NDArray[np.str_]) -> bool:

@@ -9,8 +9,8 @@ import numpy as np
 from optipmb_tools.datasets.evidence import Evidence
 from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.datasets.table.draft import Draft, numbers
-from optipmb_tools.datasets.table.findings import Claim, Reading
-from optipmb_tools.geometry import Floats
+from optipmb_tools.datasets.table.findings import HALF, Claim, Reading
+from optipmb_tools.geometry import Bools, Floats
 from optipmb_tools.table_files import unique_texts
 
 MOST_SIZES: Final = 100_000  # boxes whose sizes are looked at
@@ -34,11 +34,23 @@ def step(reading: Reading, draft: Draft) -> Draft:
     ends = (("l", 1.0 if centres else None), ("w", 1.0 if centres else None), ("h", 1.5))
     factor = reading.positive("size_factor", "a factor of sizes") or 1.0
     size = factor * np.column_stack([numbers(reading, draft, role, without) for role, without in ends])
-    unsized = np.asarray((size[:, :2] == 0.0).all(axis=1))
-    if unsized.any():
-        reading.note("sizes", f"{int(unsized.sum())} rows have a size of 0: it is unknown")
-        size[unsized] = np.nan
+    zero = np.asarray((size[:, :2] == 0.0).all(axis=1))
+    if zero.any():
+        reading.note("sizes", f"{int(zero.sum())} rows have a size of 0: it is unknown")
+        size[zero] = np.nan
+    unsized = zero | _empty_of_class(draft, size)
+    if (unsized & ~zero).any():
+        names = ", ".join(np.unique(draft.name[unsized & ~zero]).tolist())
+        reading.note("sizes", f"most boxes of class {names} have no size: it is unknown")
     return replace(draft, size=size, centres=centres, unsized=unsized)
+
+
+def _empty_of_class(draft: Draft, size: Floats) -> Bools:
+    """Return the rows (R,) without length and width whose class mostly lacks them; in others a value is missing."""
+    empty = np.isnan(size[:, :2]).all(axis=1) & np.isfinite(draft.center[:, :2]).all(axis=1)
+    kind = unique_texts(draft.name)[1]
+    placed = np.bincount(kind, np.isfinite(draft.center[:, :2]).all(axis=1))
+    return np.asarray(empty & (np.bincount(kind, empty) > HALF * placed)[kind])
 
 
 def order(reading: Reading, draft: Draft) -> Draft:
@@ -86,11 +98,15 @@ def _check_sizes(
 ) -> None:
     """Doubt sizes that would be usual ones of their classes if they were multiplied by a factor."""
     usual = {name: USUAL[kind] for name, kind in kinds.items() if kind is not None and kind in USUAL}
+    known = bool(usual)
+    usual = usual or dict.fromkeys(kinds, USUAL["car"])  # of unknown classes those of cars tell the unit of length
     rows = np.isin(names, list(usual)) & np.isfinite(sizes).all(axis=1)
     found, place = unique_texts(names[rows])
     bounds = np.array([usual[name] for name in found.tolist()]).reshape(-1, 3, 2)[place]
     claims = []
     for factor, unit in FACTORS.items():
+        if not known and unit in {"halves", "doubled"}:
+            continue
         size = sizes[rows] * float(factor)
         fits = ((size >= bounds[:, :, 0]) & (size <= bounds[:, :, 1]))[:, :sides].all(axis=1)
         both = f", or length_factor={factor} of all lengths" if unit not in {"", "halves", "doubled"} else ""
