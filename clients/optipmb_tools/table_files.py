@@ -756,6 +756,8 @@ def read_json(path: Path) -> list[_Record]:
     if isinstance(content, dict) and isinstance(content.get("results"), dict):
         how = f"--dataset nuscenes --root ROOT --detections {path}"
         raise DatasetError(path, "a table", f"results of nuScenes, which are read by {how}")
+    if isinstance(content, dict) and {"images", "annotations", "categories"} <= content.keys():
+        content = _of_coco(content)
     if isinstance(content, dict):
         known = any(isinstance(content.get(name), list) for name in LISTS)
         content = [content] if known else _of_columns(content) or _frames(content)
@@ -766,6 +768,16 @@ def read_json(path: Path) -> list[_Record]:
         if "box_type_3d" in one:
             _centre(path, one)
     return content
+
+
+def _of_coco(content: _Record) -> list[_Record]:
+    """Return the annotations of COCO with the names of their classes, and the fields of their images."""
+    names = {one["id"]: one.get("name") for one in content["categories"]}
+    images = {one["id"]: {name: value for name, value in one.items() if name != "id"} for one in content["images"]}
+    return [
+        images.get(one.get("image_id"), {}) | one | {"class": names.get(one.get("category_id"))}
+        for one in content["annotations"]
+    ]
 
 
 def _of_columns(content: _Record) -> list[_Record]:

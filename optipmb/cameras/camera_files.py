@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 FilePath = str | Path
 _MATRIX: Final = r"camera_?matrix|k|k1|m1|mtx|intrinsics?(_?matrix)?|camera_intrinsics?|intrinsic_k"
 _DISTORTION: Final = r"dist(ortion)?(_?coef(f|fs|ficients?)?)?|d|d1|dist_?params|distortion_params"
+_PROJECTION: Final = r"p|p2|projection(_?matrix)?|proj(_?mat)?|camera_projection(_matrix)?"
+_NAME: Final = r"name|id|sensor(_?(id|name))?|camera(_?(id|name))?|frame_id|channel"
 _STRUCTURE: Final = frozenset({"rows", "cols", "dt", "type_id", "header", "flags"})
 _MODELS: Final = MappingProxyType({
     "plumb_bob": "opencv", "rational_polynomial": "opencv", "radtan": "opencv", "radial_tangential": "opencv",
@@ -123,7 +125,7 @@ def read_pose(path: Path) -> dict[str, Any]:
 
 def _projection(path: Path, known: Mapping[str, str]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return the intrinsics (3, 3), rotation (3, 3) and translation (3,) of a projection (3, 4); None without one."""
-    text = _named(known, r"p|p2|projection(_?matrix)?|proj(_?mat)?|camera_projection(_matrix)?")
+    text = _named(known, _PROJECTION)
     if text is None or len(values := _numbers(path, "projection", text)) != 12:  # noqa: PLR2004 - 3 x 4
         return None
     matrix = np.array(values).reshape(3, 4)
@@ -160,25 +162,31 @@ def _quaternion(rotation: np.ndarray) -> list[float]:
 def read_numbers(path: Path) -> dict[str, str]:
     """Return the values of a file of YAML, XML or JSON by their names in small letters, as text.
 
+    Of a file with several sensors, `FILE#SENSOR` names one.
+
     Raises:
-        ParameterError: the file cannot be read.
+        ParameterError: the file cannot be read, or has several sensors of which the path names none.
     """
+    name, _, sensor = path.name.partition("#")
+    path = path.with_name(name)
     try:
         text = path.read_text(encoding="utf-8-sig")
-        if text.lstrip().startswith("{"):
-            return dict(_of_json(json.loads(text)))
+        content = json.loads(text) if text.lstrip().startswith(("{", "[")) else None
     except (OSError, ValueError) as error:
         raise ParameterError("intrinsics", "a file of ROS or OpenCV (YAML, XML, JSON)", f"{path}: {error}") from error
+    if content is not None:
+        return dict(_of_json(_chosen(path, _sensors_of_json(content, ""), sensor, content)))
     if text.lstrip().startswith("<"):
         inner = r"(?:\s*<(?:rows|cols|dt|type_id)>[^<]*</\w+>)*\s*<data>([^<]*)</data>"
         matrices = re.findall(rf"<(\w+)[^<>]*>{inner}", text)
         return {
             name.lower(): value.strip() for name, value in (*re.findall(r"<(\w+)[^<>]*>([^<]*)</", text), *matrices)
         }
+    text = _chosen(path, _sensors_of_yaml(text), sensor, text)
     values: dict[str, str] = {}
     name = ""
     for line in re.sub(r"(?m)(^|[ \t])#.*$|^%YAML.*$|^---.*$|!!opencv-matrix", "", text).split("\n"):
-        key = re.match(r"\s*[\"']?([A-Za-z]\w*)[\"']?\s*:(.*)", line)
+        key = re.match(r"\s*(?:- )?[\"']?([A-Za-z]\w*)[\"']?\s*:(.*)", line)
         if key is None:
             values[name] = f"{values.get(name, '')} {line.strip()}" if name else ""
         elif key[1] == "data":
@@ -188,6 +196,51 @@ def read_numbers(path: Path) -> dict[str, str]:
             values.setdefault(name, "")
             values[name] = key[2].strip() or values[name]
     return {name: value.strip(" \"'") for name, value in values.items() if name}
+
+
+def _chosen(path: Path, sensors: Mapping[str, Any], asked: str, whole: Any) -> Any:
+    """Return the part of a file that is of one sensor: the whole of a file with one."""
+    if asked in sensors or (len(sensors) < 2 and not asked):  # noqa: PLR2004 - one has no choice
+        return sensors.get(asked, whole)
+    expected = f"one of the sensors {', '.join(f'{path.name}#{name}' for name in sensors)}"
+    raise ParameterError("intrinsics", expected, f"{path.name}#{asked}" if asked else path.name)
+
+
+def _sensors_of_json(value: Any, name: str) -> dict[str, Any]:
+    """Return the objects that have a matrix, by their names in the file."""
+    if isinstance(value, dict) and any(_is_matrix(key) for key in value):
+        return {name: value}
+    inner = enumerate(value) if isinstance(value, list) else value.items() if isinstance(value, dict) else ()
+    found: dict[str, Any] = {}
+    for key, part in inner:
+        own = dict(_of_json(part)) if isinstance(part, dict) and isinstance(value, list) else {}
+        found |= _sensors_of_json(part, _named(own, _NAME) or str(key))
+    return found
+
+
+def _sensors_of_yaml(text: str) -> dict[str, str]:
+    """Return the parts that have a matrix, by the name before them, or that in the element of a list."""
+    lines = text.split("\n")
+    keys = [re.match(r"(\s*)(- )?[\"']?([A-Za-z]\w*)[\"']?\s*:\s*(.*)", line) for line in lines]
+    depths = [-1 if key is None else len(key[1]) + len(key[2] or "") for key in keys]
+    least = min((depth for key, depth in zip(keys, depths, strict=True) if key and _is_matrix(key[3])), default=0)
+    begins = [
+        place
+        for place, key in enumerate(keys)
+        if key is not None and len(key[1]) < least and (key[2] or (not key[4] and depths[place] < least))
+    ]
+    found: dict[str, str] = {}
+    for begin, end in zip(begins, [*begins, len(lines)][1:], strict=True):
+        own = [key for key in keys[begin:end] if key is not None]
+        if any(_is_matrix(key[3]) for key in own):
+            named = (key[4].strip(" \"'") for key in own if own[0][2] and re.fullmatch(_NAME, key[3].lower()))
+            found[next(named, str(len(found)) if own[0][2] else own[0][3])] = "\n".join(lines[begin:end])
+    return found
+
+
+def _is_matrix(name: object) -> bool:
+    """Tell whether a name is that of a matrix of a camera."""
+    return re.fullmatch(f"{_MATRIX}|{_PROJECTION}", str(name).lower()) is not None
 
 
 def _of_json(value: Any, name: str = "") -> Iterator[tuple[str, str]]:

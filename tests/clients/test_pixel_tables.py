@@ -1,5 +1,6 @@
 """Tables of pixel boxes with `--camera`, from reading to tracks; the page docs/cameras.md."""
 
+import json
 import re
 from pathlib import Path
 
@@ -211,3 +212,25 @@ def test_middles_and_shares_are_read(tmp_path: Path, camera: optipmb.GroundCamer
         data = TableDataset(tmp_path / "b.csv", {"camera": str(tmp_path / "gate.toml"), **options})
         for one, other in zip(data.sequences(["all"])[0].frames(), expected.frames(), strict=True):
             assert np.allclose(one.center[:, :2], other.center[:, :2], atol=1e-3)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_boxes_of_coco_are_places(tmp_path: Path, camera: optipmb.GroundCamera, *, whole: bool) -> None:
+    """Results of COCO and its annotations have left, top, width, height; without an option they are the same places."""
+    gate = {"camera": str(tmp_path / "gate.toml")}
+    plain = next(iter(TableDataset(write(tmp_path / "a.csv", camera, "x1,y1,x2,y2"), gate).sequences(["all"])))
+    boxes = [
+        {"image_id": k, "category_id": 3, "bbox": [*box[:2], box[2] - box[0], box[3] - box[1]], "score": 0.9}
+        for k, frame in enumerate(frames(camera))
+        for box in frame.tolist()
+    ]
+    images = [{"id": k, "file_name": f"{k}.jpg"} for k in range(30)]
+    content = {"images": images, "annotations": boxes, "categories": [{"id": 3, "name": "car"}]} if whole else boxes
+    (tmp_path / "coco.json").write_text(json.dumps(content))
+    options = gate | {"rate": "10"} | ({} if whole else {"class.3": "car"})
+    sequence = next(iter(TableDataset(tmp_path / "coco.json", options).sequences(["all"])))
+    assert sequence.labels == ("car",)
+    found = {frame.stamp_ns: frame.center for frame in sequence.frames()}
+    for frame in plain.frames():
+        if len(frame):
+            assert np.allclose(found[frame.stamp_ns][:, :2], frame.center[:, :2], atol=1e-6)

@@ -541,6 +541,26 @@ def test_a_matrix_without_a_distortion_is_a_question(tmp_path: Path) -> None:
         read_lens(tmp_path / "lens.yaml", None)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"left": {"K": [1, 0, 2, 0, 1, 3, 0, 0, 1], "D": []}, "right": {"K": [4, 0, 2, 0, 4, 3, 0, 0, 1], "D": []}}',
+        ('[{"name": "left", "K": [1, 0, 2, 0, 1, 3, 0, 0, 1], "D": []}, '
+         '{"name": "right", "K": [4, 0, 2, 0, 4, 3, 0, 0, 1], "D": []}]'),
+        ("left:\n  K: [1, 0, 2, 0, 1, 3, 0, 0, 1]\n  D: []\nright:\n  K: [4, 0, 2, 0, 4, 3, 0, 0, 1]\n  D: []\n"),
+        ("cams:\n  - name: left\n    intrinsics: [1, 1, 2, 3]\n    D: []\n  - name: right\n"
+         "    intrinsics: [4, 4, 2, 3]\n    D: []\n"),
+    ],
+)  # fmt: skip
+def test_one_of_several_sensors_is_named(tmp_path: Path, text: str) -> None:
+    """A file with several asks which, and `FILE#SENSOR` says so."""
+    (tmp_path / "rig").write_text(text)
+    assert read_lens(tmp_path / "rig#right", None)["intrinsics"] == [4.0, 4.0, 2.0, 3.0]
+    for name in ("rig", "rig#top"):
+        with pytest.raises(optipmb.ParameterError, match="one of the sensors rig#left, rig#right"):
+            read_lens(tmp_path / name, None)
+
+
 def test_poses_of_other_programs_are_read(tmp_path: Path) -> None:
     """R and t, rvec and tvec, and a matrix from the world to the camera give its place and turn."""
     expected = optipmb.GroundCamera.parse(pinhole()).pinhole

@@ -108,11 +108,7 @@ def place(
     )
     if reading.decide("camera", claims, asked="pixels" if "scale" in reading.options else None) == "shares":
         pixels *= np.resize(camera.image, pixels.shape[1])
-    if form == "xywh":
-        plain = [normalised(name).base for name in columns[:2]] == ["x", "y"]
-        text = f"{columns[0]}, {columns[1]} are taken for the left upper corner"
-        centre = Claim("cxcywh", text=text, option="--option box=xywh, cxcywh", wins="doubt", possible=plain)
-        reading.decide("camera", (Claim("xywh", possible=not plain), centre), asked=asked)
+    form = asked or _form(reading, form, columns, pixels, camera.image)
     if form == "cxcywh":
         pixels[:, :2] -= 0.5 * pixels[:, 2:]
     if form in {"xywh", "cxcywh"}:
@@ -143,6 +139,22 @@ def place(
         text = f"{left_out.total()} of {len(rows)} boxes have no place on the ground: {reasons}"
         (reading.doubt if 2 * left_out.total() > len(rows) else reading.note)("camera", text)
     return Placed(camera, columns, center, covariance)
+
+
+def _form(reading: Reading, form: str, columns: Sequence[str], pixels: Floats, image: tuple[int, int]) -> str:
+    """Return the form of boxes whose columns do not tell it: of a list, or of x, y, width and height."""
+    if form == "xywh":
+        plain = [normalised(name).base for name in columns[:2]] == ["x", "y"]
+        text = f"{columns[0]}, {columns[1]} are taken for the left upper corner"
+        centre = Claim("cxcywh", text=text, option="--option box=xywh, cxcywh", wins="doubt", possible=plain)
+        return reading.decide("camera", (Claim("xywh", possible=not plain), centre))
+    if form != "xyxy" or not normalised(columns[2]).base[-1:].isdigit() or columns[2][-2:-1].isalpha():
+        return form
+    low, high = pixels[:, :2], pixels[:, 2:]
+    text = "boxes are left, top, width, height: taken for corners, they end before they begin"
+    inside = bool(np.all((low + high <= np.array(image) + 1.0) | np.isnan(high)))
+    sides = Claim("xywh", text=text, option="--option box=xyxy", possible=inside)
+    return reading.decide("camera", (Claim("xyxy", possible=bool(np.all((high >= low) | np.isnan(high)))), sides))
 
 
 def _note_outside(reading: Reading, form: str, columns: Sequence[str], pixels: Floats, image: tuple[int, int]) -> None:
