@@ -20,7 +20,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
 from optipmb_service.links.linker import Linker
-from optipmb_service.links.rules import Passage, Region, Rules
+from optipmb_service.settings import LinkSettings
 from sites import RATE, View, World, circle, copied, corridor, plaza, tracked
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 SOON = round(1.5 * RATE)
 VECTOR = 32
+EVERY = LinkSettings(streams=("*/*/*",))
 
 
 @dataclass
@@ -74,10 +75,12 @@ def owners(tracks: Sequence[Tracks], sources: Sequence[NDArray[np.int64]] | None
 
 
 def linked(
-    rules: Rules, messages: Sequence[Tracks], vectors: dict[tuple[str, int], NDArray[np.float32]] | None = None
+    settings: LinkSettings,
+    messages: Sequence[Tracks],
+    vectors: dict[tuple[str, int], NDArray[np.float32]] | None = None,
 ) -> tuple[Linker, list[dict[Key, bytes]]]:
     """Return the linker after messages, and the global id of each track after each of them."""
-    linker, state, after = Linker(rules), {}, []
+    linker, state, after = Linker("benchmark", settings), {}, []
     for one in messages:
         given = None if vectors is None else vectors.get((one.stream, one.seq))
         linker.take(one, one.stamp_ns, given)
@@ -164,13 +167,13 @@ def overlap(
         messages.append(tracks)
         owner |= owners(tracks, sources)
     given = ordered(messages)
-    linker, after = linked(Rules("benchmark"), given)
+    linker, after = linked(EVERY, given)
     return judge(given, after, owner), linker, _found(given, views) if late else []
 
 
 def _found(messages: Sequence[Tracks], views: Sequence[View]) -> list[float]:
     """Return after how many seconds place, angle and clock are within .1 m, .2 degrees and 20 ms, for good."""
-    linker, ends, begin = Linker(Rules("benchmark")), [0.0, 0.0, 0.0], messages[0].stamp_ns
+    linker, ends, begin = Linker("benchmark", EVERY), [0.0, 0.0, 0.0], messages[0].stamp_ns
     for one in messages:
         linker.take(one, one.stamp_ns)
         if not len(linker.biases):
@@ -213,11 +216,14 @@ def passages(
         owner |= owners(tracks, source)
     given = ordered(messages)
     vectors = _vectors(given, sources, seed, equal_error) if equal_error else None
-    ways = (Passage(Region("*/west/*"), Region("*/east/*"), (10.0, 30.0)),) if declared else ()
-    ways += (Passage(Region("*/east/*"), Region("*/west/*"), (10.0, 30.0)),) if declared else ()
-    exits = (Region(polygon=((-4.0, -5.0), (24.0, -5.0), (24.0, 5.0), (-4.0, 5.0))),) if door else ()
-    rules = Rules("benchmark", passages=ways, exits=exits, embedding_model="reid" if vectors else "")
-    _, after = linked(rules, given, vectors)
+    sides = (("*/west/*", "*/east/*"), ("*/east/*", "*/west/*")) if declared else ()
+    settings = LinkSettings(
+        streams=EVERY.streams,
+        passages=tuple({"from": one, "to": other, "s": (10.0, 30.0)} for one, other in sides),
+        exits=(((-4.0, -5.0), (24.0, -5.0), (24.0, 5.0), (-4.0, 5.0)),) if door else (),
+        embedding_model="reid" if vectors else "",
+    )
+    _, after = linked(settings, given, vectors)
     wanted = Counter(one for (_, _), one in owner.items() if one >= 0)
     streams: dict[bytes, set[Key]] = defaultdict(set)
     for key, one in after[-1].items():
@@ -279,7 +285,7 @@ def cost(seed: int) -> tuple[float, float, float]:
     places = [(x, y) for x in np.linspace(-130.0, 130.0, 10) for y in (-25.0, 25.0)]
     views = [View(f"site/n{k}/lidar", circle(x, y, 34.0)) for k, (x, y) in enumerate(places)]
     messages = ordered([copied(world, view, seed) for view in views])
-    linker = Linker(Rules("benchmark"))
+    linker = Linker("benchmark", EVERY)
     half = len(messages) // 2
     for one in messages[:half]:
         linker.take(one, one.stamp_ns)
@@ -287,7 +293,11 @@ def cost(seed: int) -> tuple[float, float, float]:
     for one in messages[half:]:
         linker.take(one, one.stamp_ns)
     share = (time.process_time() - begin) / 10.0
-    return share, float(np.mean([len(one.id) for one in messages])), len(linker.state()) / max(len(linker.objects), 1)
+    return (
+        share,
+        float(np.mean([len(one.id) for one in messages])),
+        len(linker.state()) / max(len(linker.objects.table), 1),
+    )
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from optipmb_schemas import Message, Problem, encode, encoding_of
 
 from optipmb_client.errors import ConnectionFailed
 
-__all__ = ["Declared", "Dispatcher", "ItemQueue", "Query", "Sender", "directly", "reason", "usable"]
+__all__ = ["Declaration", "Dispatcher", "ItemQueue", "Query", "Sender", "directly", "reason", "usable"]
 
 CLOSE_S = 5.0
 """Longest wait of `close` until received items are handed over."""
@@ -28,7 +28,7 @@ _Item = TypeVar("_Item")
 _thread = threading.local()  # lives as long as the state of the thread does
 
 
-class Declared:
+class Declaration:
     """Something declared on a session.
 
     Args:
@@ -36,7 +36,7 @@ class Declared:
         forget: Called with this object once it is withdrawn.
     """
 
-    def __init__(self, undeclare: Callable[[], object], forget: "Callable[[Declared], None]") -> None:
+    def __init__(self, undeclare: Callable[[], object], forget: "Callable[[Declaration], None]") -> None:
         self._undeclare: Callable[[], object] | None = undeclare
         self._forget = forget
 
@@ -49,7 +49,7 @@ class Declared:
             self._forget(self)
 
 
-class Sender(Declared):
+class Sender(Declaration):
     """A publisher of encoded messages on one key.
 
     It is withdrawn by letting go of it; a message that another thread is sending may still go out. What Zenoh calls
@@ -58,7 +58,7 @@ class Sender(Declared):
 
     Args:
         publisher: Zenoh's.
-        forget: As for `Declared`.
+        forget: As for `Declaration`.
         withdraw: Called with a function that lets go of the publisher.
         cached: Whether the publisher keeps messages for recovery.
     """
@@ -66,7 +66,7 @@ class Sender(Declared):
     def __init__(
         self,
         publisher: Any,
-        forget: Callable[[Declared], None],
+        forget: Callable[[Declaration], None],
         withdraw: Callable[[Callable[[], object]], object],
         *,
         cached: bool,
@@ -126,7 +126,7 @@ class Dispatcher:
     def __init__(
         self,
         name: str,
-        declared: Declared,
+        declared: Declaration,
         items: Iterable[_Item],
         receive: Callable[[_Item], None],
         failed: Callable[[str], object],

@@ -21,7 +21,7 @@ from optipmb_client.incoming import Answer, Arrival
 from optipmb_client.trace_context import attached
 from optipmb_client.zenoh.handles import (
     CLOSE_S,
-    Declared,
+    Declaration,
     Dispatcher,
     ItemQueue,
     Query,
@@ -141,7 +141,7 @@ class Session:
         self._lock = threading.Lock()
         self._keys = self._open_keys = 0
         self._readings: set[Dispatcher] = set()
-        self._declared: set[Declared] = set()
+        self._declared: set[Declaration] = set()
         """References: Zenoh withdraws declarations without any. Senders are withdrawn so."""
         self._senders: weakref.WeakSet[Sender] = weakref.WeakSet()
         self._linking: set[str] = set()
@@ -303,7 +303,7 @@ class Session:
 
     def listen(
         self, key: str, receive: Callable[[Sample], object], *, recovers: bool = False, history: Any = None
-    ) -> Declared:
+    ) -> Declaration:
         """Hand over samples on the thread of the network that brings them, which must not be kept waiting.
 
         Args:
@@ -330,7 +330,7 @@ class Session:
             )
         return self._keep(subscriber.undeclare, keys)
 
-    def declare_key(self, key: str) -> Declared:
+    def declare_key(self, key: str) -> Declaration:
         """Declare a key whose messages are received by a subscription to a pattern.
 
         Zenoh hands over the messages of a declared key without comparing it with all subscriptions for each of them.
@@ -341,7 +341,7 @@ class Session:
 
     # Tokens and links
 
-    def token(self, key: str) -> Declared:
+    def token(self, key: str) -> Declaration:
         """Declare a liveliness token."""
         with usable():
             token = self._session.liveliness().declare_token(key)
@@ -475,7 +475,7 @@ class Session:
     def _read(
         self,
         name: str,
-        declared: Declared,
+        declared: Declaration,
         items: Iterable[_Item],
         receive: Callable[[_Item], None],
         ended: Callable[[], None] = lambda: None,
@@ -488,12 +488,12 @@ class Session:
         self._readings.add(reading)
         return reading
 
-    def _keep(self, undeclare: Callable[[], object], keys: int) -> Declared:
-        def forget(declared: Declared) -> None:
+    def _keep(self, undeclare: Callable[[], object], keys: int) -> Declaration:
+        def forget(declared: Declaration) -> None:
             self._declared.discard(declared)
             self._free(keys)
 
-        declared = Declared(partial(self._withdraw, undeclare), forget)
+        declared = Declaration(partial(self._withdraw, undeclare), forget)
         self._declared.add(declared)
         return declared
 

@@ -21,18 +21,20 @@ import structlog
 from optipmb import Georeference
 from optipmb_service.app.storage import open_store
 from optipmb_service.cluster.store import Fenced, StoreError, Write, load_newest
-from optipmb_service.links.linker import MOST_STREAMS, Linker
-from optipmb_service.links.rules import Passage, Placement, Region, Rules
+from optipmb_service.links.inputs import MOST_STREAMS
+from optipmb_service.links.linker import Linker
+from optipmb_service.links.places import WorldFrame
 from optipmb_service.session.problems import problem_of
 from optipmb_service.telemetry.health import Component
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from optipmb_client.incoming import Arrival
     from optipmb_client.zenoh.handles import Query
 
-    from optipmb_service.links.linker import Row
-    from optipmb_service.settings import LinkRegion, LinkSettings, Settings
+    from optipmb_service.settings import LinkSettings, Settings
     from optipmb_service.zenoh.client import Client
 
 log = structlog.get_logger("optipmb_service")
@@ -54,7 +56,7 @@ VECTOR_S: Final = 1.0
 REACH_S: Final = 10.0
 
 
-class Area:
+class LinkedArea:
     """One area: its linker, its publisher and its checkpoint.
 
     Args:
@@ -70,9 +72,9 @@ class Area:
         self.name, self.settings = name, settings.links[name]
         self._client, self._store, self._instance = client, store, settings.instance
         self._kept = f"links/{name}/state"
-        self.rules = _rules(name, self.settings, settings)
-        kept = load_newest(store, self._kept, partial(Linker.restored, self.rules), ValueError, self._torn)
-        self.linker = kept or Linker(self.rules)
+        about = name, self.settings, _frames(self.settings, settings)
+        kept = load_newest(store, self._kept, partial(Linker.restored, *about), ValueError, self._torn)
+        self.linker = kept or Linker(*about)
         self.lock = threading.Lock()
         self.replaced = False
         """Whether another process has taken the area."""
@@ -138,10 +140,9 @@ class Area:
         query.answer(self._key, message)
         query.finish()
 
-    def _message(self, rows: list[Row], *, whole: bool) -> schemas.Links:
+    def _message(self, rows: list[schemas.LinkedObject], *, whole: bool) -> schemas.Links:
         self._revision = max(self._revision + 1, time.time_ns() // 1_000_000)
-        objects = tuple(schemas.LinkedObject.trusted(row._asdict()) for row in rows)
-        stamp_ns = max(self.linker.grid_ns, 0)
+        stamp_ns, objects = max(self.linker.grid_ns, 0), tuple(rows)
         return schemas.Links(area=self.name, revision=self._revision, stamp_ns=stamp_ns, whole=whole, objects=objects)
 
     def _torn(self, error: ValueError) -> None:
@@ -162,7 +163,7 @@ class LinkBridge(Component):
         self.messages: Counter[str] = Counter()
         self.reporter = ProblemReporter(client.publish_problem)
         self._store, self._why = open_store(settings, None)
-        self.areas = [Area(name, settings, client, self._store) for name in settings.links]
+        self.areas = [LinkedArea(name, settings, client, self._store) for name in settings.links]
         self._vectors: dict[str, OrderedDict[tuple[bytes, int], Any]] = {}
         self._begun = time.monotonic()
         self._due_s = 0.0
@@ -187,12 +188,12 @@ class LinkBridge(Component):
         total = Counter(self.messages)
         for area in self.areas:
             with area.lock:
-                total.update(area.linker.counters)
+                total.update(area.linker.inputs.counters)
         return {name: count for name, count in total.items() if name != "taken"}
 
     def objects(self, *, linked: bool) -> dict[str, int]:
         """Return how many objects each area remembers, or has linked."""
-        return {one.name: one.linker.linked if linked else len(one.linker.objects) for one in self.areas}
+        return {one.name: one.linker.linked if linked else len(one.linker.objects.table) for one in self.areas}
 
     def work(self) -> None:
         """Save and report; to be called often."""
@@ -261,7 +262,7 @@ class LinkBridge(Component):
         for area in areas:
             area.take(content, arrived_ns, vectors if area.settings.embedding_model else None)
 
-    def _areas_of(self, key: str) -> list[Area]:
+    def _areas_of(self, key: str) -> list[LinkedArea]:
         stream = self._client.keys.stream_of(key)
         return [one for one in self.areas if any(fnmatchcase(stream, part) for part in one.settings.streams)]
 
@@ -302,33 +303,21 @@ def _whole(pattern: str) -> str:
     return "/".join("*" if "*" in part else part for part in pattern.split("/"))
 
 
-def _rules(name: str, own: LinkSettings, settings: Settings) -> Rules:
-    """Return the rules of an area, with its first site in `sites` as the plane."""
+def _frames(own: LinkSettings, settings: Settings) -> Callable[[str], WorldFrame]:
+    """Return what places the world frames of streams in an area, with its first site in `sites` as the plane."""
     planes: dict[str, int] = {}
     places = {site: Georeference(one.origin, one.x_heading) for site, one in settings.sites.items()}
     first = next((places[one] for one in sorted(places)), None)
 
-    def place(stream: str) -> Placement:
+    def frame(stream: str) -> WorldFrame:
         site = stream.partition("/")[0]
-        if (frame := own.frames.get(site)) is not None:
-            return Placement(0, *frame.translation, frame.yaw)
+        if (given := own.frames.get(site)) is not None:
+            return WorldFrame(0, *given.translation, given.yaw)
         if site not in places or first is None:
             # Of a site whose place is not known, the places can be compared with each other alone.
-            return Placement(planes.setdefault(site, 1 + len(planes)))
+            return WorldFrame(planes.setdefault(site, 1 + len(planes)))
         corners = places[site].to_geographic(np.array(((0.0, 0.0, 0.0), (100.0, 0.0, 0.0))), np.zeros(2))
         (x, y, _), (u, v, _) = first.to_world(corners.lat, corners.lon, corners.alt).tolist()
-        return Placement(0, x, y, float(np.arctan2(v - y, u - x)))
+        return WorldFrame(0, x, y, float(np.arctan2(v - y, u - x)))
 
-    def region(one: LinkRegion) -> Region:
-        return Region(one.streams, one.polygon)
-
-    return Rules(
-        name,
-        place,
-        tuple(Passage(region(one.from_), region(one.to), one.s) for one in own.passages),
-        tuple(map(region, own.exits)),
-        own.min_probability,
-        own.gap_s,
-        own.most,
-        own.embedding_model,
-    )
+    return frame

@@ -19,13 +19,14 @@ import numpy as np
 
 from optipmb.joining.rejoin import KERNEL_M, QUANTUM, REACH_M, RETURNS, SHORTEST_S, Motion, match, pair_scores
 from optipmb.model.lost_objects import Tracklets
-from optipmb_service.links.rules import AREA_M2, MOTION
+from optipmb_service.links.kinds import AREA_M2, MOTION
+from optipmb_service.links.places import area_m2, inside
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb.model.rows import Array, Index
-    from optipmb_service.links.rules import Passage, Region, Rules
+    from optipmb_service.settings import LinkPassage, LinkRegion, LinkSettings
 
     Table = NDArray[np.void]
 
@@ -171,7 +172,7 @@ def _taught(learned: Learned, lost: End, young: End, seconds: Array) -> Array:
     return total / (2.0 * np.pi * KERNEL_M**2)
 
 
-def _declared(passage: Passage, seconds: Array) -> Array:
+def _declared(passage: LinkPassage, seconds: Array) -> Array:
     """Return the density of the time (L, Y), 1/s: uniform between the bounds, with an edge of a tenth."""
     low, high = passage.s
     edge = 0.1 * (high - low) + 1e-3
@@ -179,34 +180,26 @@ def _declared(passage: Passage, seconds: Array) -> Array:
     return np.asarray(np.exp(-0.5 * (beyond / edge) ** 2) / (high - low + 2.5 * edge))
 
 
-def _inside(region: Region, names: dict[int, str], which: End) -> NDArray[np.bool_]:
+def _inside(region: LinkRegion, names: dict[int, str], which: End) -> NDArray[np.bool_]:
     held = np.zeros(len(which.number), np.bool_)
     for stream in np.unique(which.stream).tolist():
         at = np.flatnonzero(which.stream == stream)
-        held[at] = region.holds(names[stream], which.local[at])
+        held[at] = inside(region, names[stream], which.local[at])
     return held
 
 
-class Decision(NamedTuple):
-    """Decisions on beginnings (Y,): the row of the lost object of each, -1 for a new one, and its probability."""
-
-    partner: Index
-    probability: Array
-    learned: Learned
-
-
 def decide(
-    rules: Rules,
+    settings: LinkSettings,
     names: dict[int, str],
     learned: Learned,
     ends: tuple[End, End, NDArray[np.bool_]],
     more: Array,
     stamp_ns: int,
-) -> Decision:
-    """Decide on beginnings.
+) -> tuple[Index, Array, Learned]:
+    """Return the row of the lost object of each beginning (Y,), -1 for a new one, its probability, and the examples.
 
     Args:
-        rules: of the area.
+        settings: of the area.
         names: of the streams.
         learned: until now.
         ends: lost objects (L,), beginnings (Y,), and which of these are to be decided.
@@ -216,7 +209,7 @@ def decide(
     lost, young, due = ends
     rate, whole = rates(learned, young, stamp_ns)
     seconds = np.maximum((young.stamp_ns - lost.stamp_ns[:, None]) * 1e-9, 1e-3)
-    fits = (young.stamp_ns > lost.stamp_ns[:, None]) & (seconds <= rules.gap_s)
+    fits = (young.stamp_ns > lost.stamp_ns[:, None]) & (seconds <= settings.gap_s)
     fits &= (lost.kind[:, None] == young.kind) | (lost.kind[:, None] == 0) | (young.kind == 0)
     # No object is faster than its kind allows, also on learned ways.
     apart = np.hypot(*np.moveaxis(young.place - lost.place[:, None], 2, 0))
@@ -224,17 +217,17 @@ def decide(
     fits &= (lost.plane[:, None] != young.plane) | (apart <= reach)
     gone, new = np.zeros(len(lost.number), np.bool_), np.zeros(len(young.number), np.bool_)
 
-    for exit_ in rules.exits:
+    for exit_ in settings.exits:
         gone, new = gone | _inside(exit_, names, lost), new | _inside(exit_, names, young)
     fits &= ~gone[:, None] & ~new
-    odds = np.exp(np.minimum(_moved(lost, young, rules.gap_s), 50.0)) + _taught(learned, lost, young, seconds)
+    odds = np.exp(np.minimum(_moved(lost, young, settings.gap_s), 50.0)) + _taught(learned, lost, young, seconds)
     somehow = np.where(lost.plane[:, None] == young.plane, ANYHOW, RETURNS)
-    odds = odds / rate + somehow / (seconds * np.log1p(rules.gap_s / SHORTEST_S)) / whole
-    for passage in rules.passages:
-        way = _inside(passage.begin, names, lost)[:, None] & _inside(passage.end, names, young)
+    odds = odds / rate + somehow / (seconds * np.log1p(settings.gap_s / SHORTEST_S)) / whole
+    for passage in settings.passages:
+        way = _inside(passage.from_, names, lost)[:, None] & _inside(passage.to, names, young)
         if not way.any():
             continue
-        mouth = np.minimum(whole, rate * (passage.end.area_m2 + 2.0 * np.pi * KERNEL_M**2))
+        mouth = np.minimum(whole, rate * (area_m2(passage.to) + 2.0 * np.pi * KERNEL_M**2))
         odds = odds + way * DECLARED * _declared(passage, seconds) / mouth
     odds = np.where(fits, odds * np.exp(more), 0.0)
     odds = np.minimum(odds, MOST_ODDS)
@@ -247,8 +240,8 @@ def decide(
         taken, margin, _ = match(before, after, value, due, len(lost.number))
         at = np.flatnonzero(taken & due[after])
         partner[after[at]], sure[after[at]] = before[at], 1.0 / (1.0 + np.exp(-margin[at]))
-    partner[sure < rules.min_probability] = -1
-    return Decision(partner, sure, _learnt(learned, lost, young, share, seconds, due & ~new))
+    partner[sure < settings.min_probability] = -1
+    return partner, sure, _learnt(learned, lost, young, share, seconds, due & ~new)
 
 
 def _learnt(learned: Learned, lost: End, young: End, share: Array, seconds: Array, due: NDArray[np.bool_]) -> Learned:

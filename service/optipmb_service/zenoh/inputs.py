@@ -26,7 +26,7 @@ from optipmb_client.zenoh.session import NEWEST
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-    from optipmb_client.zenoh.handles import Declared
+    from optipmb_client.zenoh.handles import Declaration
     from optipmb_client.zenoh.session import Sample, Session
 
 log = structlog.get_logger("optipmb_service")
@@ -130,7 +130,7 @@ class Topic:
         self._turn = threading.Lock()
         self._closed = False
         self._drained = threading.Event()
-        self._subscribers: dict[str, tuple[str, Declared]] = {}
+        self._subscribers: dict[str, tuple[str, Declaration]] = {}
         self._queries: CacheQueries[Sample] = CacheQueries(session.ask)
         self._late_join: LateJoin[Sample] = LateJoin(self._hand_over, self._queries.ask, answered)
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from collections.abc import Set as AbstractSet
 
-    from optipmb_client.zenoh.handles import Declared, Dispatcher, Query, Sender
+    from optipmb_client.zenoh.handles import Declaration, Dispatcher, Query, Sender
     from optipmb_client.zenoh.session import Sample, Session
 
     from optipmb_service.settings import Settings
@@ -50,7 +50,9 @@ log = structlog.get_logger("optipmb_service")
 class StreamPublisher:
     """The publishers of a stream's tracks and events, and what else is declared while it is there."""
 
-    def __init__(self, sender: Sender, events: Sender | None, now: Sender | None, others: Sequence[Declared]) -> None:
+    def __init__(
+        self, sender: Sender, events: Sender | None, now: Sender | None, others: Sequence[Declaration]
+    ) -> None:
         self._declared = (*others, *(one for one in (events, now, sender) if one is not None))
         self.publish = sender.put
         self.publish_events = (events or sender).put
@@ -72,7 +74,7 @@ class Announcements:
         self._session, self._keys, self._instance, self._run = session, keys, instance, run
         self._groups: dict[str, tuple[str, ...]] = {}
         """The group of each stream that is announced."""
-        self._tokens: dict[tuple[str, ...], Declared] = {}
+        self._tokens: dict[tuple[str, ...], Declaration] = {}
 
     def announce(self, streams: AbstractSet[str]) -> None:
         """Announce these streams, and no others; streams that stay are announced all the time."""
@@ -117,7 +119,7 @@ class Transport:
         self.discover = Announcements(self._client, self._keys, self._instance, self._run).announce
         """Announces streams, and no others."""
         self._returned = ReturnedPublishers(self._client, lambda *_: 0)
-        self._alive: Declared | None = None
+        self._alive: Declaration | None = None
         self._owners: Dispatcher | None = None
 
     # Receiving

@@ -2,12 +2,15 @@
 
 import dataclasses
 import random
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 from optipmb_schemas import Tracks
 from optipmb_service.links.linker import Linker
-from optipmb_service.links.rules import Passage, Placement, Region, Rules
+from optipmb_service.links.places import WorldFrame
+from optipmb_service.settings import LinkSettings
 from sites import BEGIN_NS, RATE, View, World, circle, copied, corridor, plaza
 from tracks_message import tracks_message
 
@@ -19,8 +22,17 @@ def together(*streams: list[Tracks]) -> list[Tracks]:
     return [one for frame in zip(*streams, strict=True) for one in frame]
 
 
+def area(frame: Callable[[str], WorldFrame] = lambda _: WorldFrame(), **settings: Any) -> Linker:
+    return Linker("area", LinkSettings(streams=("*/*/*",), **settings), frame)
+
+
+def again(state: bytes) -> Linker:
+    new = area()
+    return Linker.restored(new.area, new.settings, new.inputs.frame, state)
+
+
 def run(messages: list[Tracks], linker: Linker | None = None) -> Linker:
-    linker = linker or Linker(Rules("area"))
+    linker = linker or area()
     for one in messages:
         linker.take(one, one.stamp_ns)
     return linker
@@ -79,7 +91,7 @@ def test_state_goes_on(site: tuple[World, list[Tracks]]) -> None:
     for cut in (1, 17, 118):
         part = run(messages[:cut])
         rows, changes = part.rows(), part.changes()
-        part = Linker.restored(part.rules, part.state())
+        part = again(part.state())
         assert part.rows() == rows
         run(messages[cut:], part)
         assert part.state() == whole.state()
@@ -88,10 +100,9 @@ def test_state_goes_on(site: tuple[World, list[Tracks]]) -> None:
 
 def test_state_refused() -> None:
     """A state of another version, and bytes that are none, are refused."""
-    rules = Rules("area")
-    for state in (b"", b"\x81", Linker(rules).state()[:-3], b"\x95\x07" + Linker(rules).state()[2:]):
+    for state in (b"", b"\x81", area().state()[:-3], b"\x95\x07" + area().state()[2:]):
         with pytest.raises(ValueError, match="state of links"):
-            Linker.restored(rules, state)
+            again(state)
 
 
 def test_disorder(site: tuple[World, list[Tracks]]) -> None:
@@ -106,7 +117,7 @@ def test_disorder(site: tuple[World, list[Tracks]]) -> None:
     for linker in (one, other):
         found = ids(linker)
         assert all(found["site/west/lidar", n] == found["site/east/lidar", n] for n in common(world))
-    assert other.counters["repeated"] + other.counters["late"] > 50
+    assert other.inputs.counters["repeated"] + other.inputs.counters["late"] > 50
 
 
 @pytest.mark.parametrize("off_s", [-3600.0, 3600.0, 5.0])
@@ -117,13 +128,13 @@ def test_wrong_clock(off_s: float, site: tuple[World, list[Tracks]]) -> None:
         one.model_copy(update={"stamp_ns": one.stamp_ns + round(off_s * 1e9)})
         for one in copied(world, View("site/wrong/lidar", circle(0.0, 0.0, 40.0)), 3)
     ]
-    linker = Linker(Rules("area"))
+    linker = area()
     for n, one in enumerate(messages):
         linker.take(one, one.stamp_ns)
         if n % 2:
             linker.take(third[n // 2], one.stamp_ns)
     assert ids(linker) == ids(run(messages))
-    assert "stamps are" in linker.problems["site/wrong/lidar", "wrong_clock"]
+    assert "stamps are" in linker.inputs.problems["site/wrong/lidar", "wrong_clock"]
 
 
 def test_parting() -> None:
@@ -131,7 +142,7 @@ def test_parting() -> None:
     pair = beside(line(1.0, y=-0.15), line(1.0, y=0.15, turn=2.0))
     west = copied(World(pair.label[:1], pair.place[:, :1]), WEST, 1)
     east = copied(World(pair.label[1:], pair.place[:, 1:]), EAST, 1)
-    linker, seen = Linker(Rules("area")), []
+    linker, seen = area(), []
     for one in together(west, east):
         linker.take(one, one.stamp_ns)
         seen.append(len(linker.rows()))
@@ -180,8 +191,7 @@ def walks() -> list[Tracks]:
 @pytest.mark.parametrize("planes", [0, 1])
 def test_passages_are_learned(planes: int, walks: list[Tracks]) -> None:
     """Objects that pass from view to view keep their id, also where nobody knows how the world frames lie."""
-    rules = Rules("area", place=lambda stream: Placement(plane=planes if stream == "b/n/s" else 0))
-    linker = Linker(rules)
+    linker = area(lambda stream: WorldFrame(plane=planes if stream == "b/n/s" else 0))
     linked = set()
     for one in walks:
         linker.take(one, one.stamp_ns)
@@ -195,9 +205,9 @@ def test_passages_are_learned(planes: int, walks: list[Tracks]) -> None:
 
 def test_exit(walks: list[Tracks]) -> None:
     """Nothing that ended at an exit comes back anywhere."""
-    door = Region("a/*/*", ((-4.0, -5.0), (2.0, -5.0), (2.0, 5.0), (-4.0, 5.0)))
-    passage = Passage(Region("a/*/*"), Region("b/*/*"), (10.0, 20.0))
-    linker = run(walks, Linker(Rules("area", passages=(passage,), exits=(door,))))
+    door = {"streams": "a/*/*", "polygon": ((-4.0, -5.0), (2.0, -5.0), (2.0, 5.0), (-4.0, 5.0))}
+    passage = {"from": "a/*/*", "to": "b/*/*", "s": (10.0, 20.0)}
+    linker = run(walks, area(passages=(passage,), exits=(door,)))
     assert linker.rows() == []
 
 
@@ -205,7 +215,7 @@ def test_many() -> None:
     """A thousand objects, and many tracks at one place, are bounded and named."""
     rng = np.random.default_rng(0)
     place = np.column_stack((rng.uniform(-200, 200, (1000, 2)), np.zeros(1000)))
-    linker = Linker(Rules("area", most=1500))
+    linker = area(most=1500)
     for n in range(8):
         for stream, offset, session in (("a/n/s", 0, n // 4), ("b/n/s", 1, n // 4)):
             linker.take(
@@ -221,15 +231,15 @@ def test_many() -> None:
                 ),
                 BEGIN_NS + n * 200_000_000,
             )
-    assert len(linker.objects) <= 1500 + 1000
-    assert ("", "too_many_objects") in linker.problems
-    crowd = Linker(Rules("area"))
+    assert len(linker.objects.table) <= 1500 + 1000
+    assert ("", "too_many_objects") in linker.inputs.problems
+    crowd = area()
     for n in range(4):
         for stream in ("a/n/s", "b/n/s"):
             crowd.take(
                 tracks_message(stream, n, list(range(2500)), stamp_ns=BEGIN_NS + n * 200_000_000, confirmed=1),
                 BEGIN_NS + n * 200_000_000,
             )
-    assert {code for _, code in crowd.problems} == {"crowded", "too_many_tracks"}
+    assert {code for _, code in crowd.inputs.problems} == {"crowded", "too_many_tracks"}
     assert crowd.rows() == []
     assert len(crowd.pairs) == 0
