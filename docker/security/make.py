@@ -90,7 +90,8 @@ def service(prefix: str, name: str) -> Role:
     """Give a tracking service: it reads all inputs, writes all outputs, answers, and owns streams."""
     inputs = recoverable(f"{prefix}/*/*/*/detections", f"{prefix}/*/*/*/points")
     outputs = recoverable(*(f"{prefix}/*/*/*/{topic}" for topic in OUTPUTS))
-    questions = (f"{prefix}/*/*/*/q/*", f"{prefix}/service/*/q/*")
+    outputs += recoverable(f"{prefix}/links/*")
+    questions = (f"{prefix}/*/*/*/q/*", f"{prefix}/service/*/q/*", f"{prefix}/links/*/q/links")
     presence = (f"{prefix}/service/**", f"{prefix}/owner/**")
     return Role(
         f"service/{name}",
@@ -112,8 +113,9 @@ def service(prefix: str, name: str) -> Role:
 def viewer(prefix: str, name: str) -> Role:
     """Give a person or program that looks: it reads everything, asks about it, and writes nothing."""
     everything = recoverable(*(f"{prefix}/*/*/*/{topic}" for topic in ("detections", "points", *OUTPUTS)))
+    everything += recoverable(f"{prefix}/links/*")
     questions = tuple(f"{prefix}/*/*/*/q/{what}" for what in ("state", "density", "tracks"))
-    questions += (f"{prefix}/service/*/q/status", f"{prefix}/service/*/q/metrics")
+    questions += (f"{prefix}/service/*/q/status", f"{prefix}/service/*/q/metrics", f"{prefix}/links/*/q/links")
     presence = (f"{prefix}/service/**", f"{prefix}/owner/**")
     return Role(
         f"viewer/{name}",
@@ -127,7 +129,7 @@ def gateway(prefix: str, name: str) -> Role:
     """Give a gRPC gateway: it acts with its callers' rights, and checks their certificates itself."""
     inputs = recoverable(f"{prefix}/*/*/*/detections", f"{prefix}/*/*/*/points")
     outputs = recoverable(*(f"{prefix}/*/*/*/{topic}" for topic in OUTPUTS))
-    questions = (f"{prefix}/*/*/*/q/*", f"{prefix}/service/*/q/status")
+    questions = (f"{prefix}/*/*/*/q/*", f"{prefix}/service/*/q/status", f"{prefix}/links/*/q/links")
     presence = (f"{prefix}/service/*/alive",)
     return Role(
         f"gateway/{name}",

@@ -19,7 +19,7 @@ from optipmb_schemas.codec import encode_json
 from optipmb_schemas.control import Problem
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -72,6 +72,10 @@ class EdgeTrack(Struct, frozen=True, rename={"kind": "class"}):
     ) = UNSET
     object_probability: (
         Annotated[float, Meta(description="Probability that all joins of the object are right.")] | UnsetType
+    ) = UNSET
+    global_id: (
+        Annotated[str, Meta(description="32 hexadecimal digits: one in all streams. Absent: it is not linked.")]
+        | UnsetType
     ) = UNSET
     lat: Lat | UnsetType = UNSET
     lon: Lon | UnsetType = UNSET
@@ -266,8 +270,10 @@ def _objects(tracks: Tracks, rows: NDArray[np.int64]) -> dict[str, Iterable[Any]
     return {"object": [one for one, _ in told], "object_probability": [share for _, share in told]}
 
 
-def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place | None = None) -> bytes:
-    """Return the selected tracks of a frame as one text."""
+def tracks_json(
+    tracks: Tracks, selection: Selection = EVERYTHING, place: Place | None = None, global_ids: Sequence[str] = ()
+) -> bytes:
+    """Return the selected tracks of a frame as one text; `global_ids` of all tracks, empty where there is none."""
     rows = np.flatnonzero(selection.rows(tracks))
     center, size, yaw = tracks.center, tracks.size, tracks.yaw
     if tracks.measured is not None:  # NaN becomes null
@@ -290,6 +296,7 @@ def tracks_json(tracks: Tracks, selection: Selection = EVERYTHING, place: Place 
         "confirmed": shown(tracks)[rows].tolist(),
         **{name: np.round(column[rows], DIGITS).tolist() for name, column in numbers.items()},
         **_objects(tracks, rows),
+        "global_id": (global_ids[row] or UNSET for row in rows.tolist()) if global_ids else repeat(UNSET),
         **dict(zip(PLACE, _placed(tracks.center[rows], yaw[rows], place), strict=True)),
     }
     if selection.fields:

@@ -3,7 +3,7 @@
 <prefix>/<stream>/detections | points | tracks | now | events | problems     publications
 <prefix>/<stream>/q/state | q/density | q/tracks | q/zones | q/reset | q/parameters    queries
 <prefix>/links/<area>                                         publications: which objects of streams are one
-<prefix>/links/<area>/q/state                                 query
+<prefix>/links/<area>/q/links                                 query
 <prefix>/owner/<stream>/<instance>                            liveliness: who tracks this stream
 <prefix>/service/<instance>/alive                             liveliness: which services are there
 <prefix>/service/<instance>/discovered/<run>/<streams>        liveliness: streams whose publishers say nothing
@@ -63,7 +63,15 @@ class Keys:
 
     def links_query(self, area: str) -> str:
         """Return the key of the query for all links of an area."""
-        return f"{self.links(area)}/q/state"
+        return f"{self.links(area)}/q/links"
+
+    def all_links(self) -> str:
+        """Return the key expression of the links of all areas."""
+        return f"{self.prefix}/links/*"
+
+    def all_links_query(self) -> str:
+        """Return the key expression of the queries for all links of all areas."""
+        return f"{self.all_links()}/q/links"
 
     def query(self, stream: str, what: Query) -> str:
         """Return the key of a query about a stream."""

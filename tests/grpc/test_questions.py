@@ -114,7 +114,7 @@ def test_a_client_that_has_no_schema(gateway: GatewayProcess, stub: Any, stream:
     service = pool.FindServiceByName(SERVICE)
     assert {method.name for method in service.methods} == {
         "Track", "Publish", "Subscribe", "SubscribeEvents", "QueryTracks", "GetState", "Reset", "SetParameters",
-        "ListStreams",
+        "ListStreams", "GetLinks",
     }  # fmt: skip
     method = service.FindMethodByName("GetState")
     asked = GetMessageClass(method.input_type)(stream=stream)

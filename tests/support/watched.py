@@ -16,6 +16,8 @@ from optipmb_schemas import (
     Delivery,
     Events,
     Keys,
+    LinkedObject,
+    Links,
     Message,
     Problem,
     ServiceStatus,
@@ -45,6 +47,8 @@ class Session:
         self.instances: list[str] = ["one"]
         self.statuses: list[Message] = []
         self.problems: list[Problem] = []
+        self.links: list[Links] = []  # answers of `q/links`
+        self.linking: Callable[[Message], None] = lambda _: None
         self.counted: list[Events] = []  # answers of `q/zones`; without zones: an error
         self.gate = threading.Event()
         self.gate.set()
@@ -81,6 +85,9 @@ class Session:
             payload = SimpleNamespace(to_bytes=lambda: encode(message))
             receive(SimpleNamespace(key_expr=key_of(message), payload=payload, encoding=encoding_of(message)))
 
+        if key == KEYS.all_links():
+            self.linking = put
+            return SimpleNamespace(close=lambda: None)
         return self._add(key, put)
 
     def query(self, selector: str, *, timeout: float = 2.0) -> list[Answer]:
@@ -89,6 +96,8 @@ class Session:
             stream = selector.removesuffix("/q/zones").removeprefix(f"{KEYS.prefix}/")
             answers = [one for one in self.counted if one.stream == stream]
             return [Answer(selector, encode(one), encoding_of(one), ok=one.zones is not None) for one in answers]
+        if selector == KEYS.all_links_query():
+            return [Answer(selector, encode(one), encoding_of(one), ok=True) for one in self.links]
         if selector == KEYS.all_status():
             return [Answer("status", encode(one), encoding_of(one), ok=True) for one in self.statuses]
         key, _, parameters = selector.partition("/@adv/**")
@@ -113,12 +122,17 @@ class Session:
 
     def publish(self, *messages: Message) -> None:
         for message in messages:
+            if isinstance(message, Links):
+                self.linking(message)
+                continue
             for key, put in tuple(self.subscriptions):
                 if fnmatch.fnmatchcase(key_of(message), key):
                     put(message)
 
 
 def key_of(message: Any) -> str:
+    if isinstance(message, Links):
+        return KEYS.links(message.area)
     topics = {"Tracks": "tracks", "Events": "events", "Detections": "detections", "Problem": "problems"}
     topic = "now" if getattr(message, "predicted_to_ns", None) is not None else topics[type(message).__name__]
     return f"{KEYS.prefix}/{message.stream}/{topic}"
@@ -241,6 +255,16 @@ PROBLEM = Problem(stream=STREAM, instance="one", code="late", message="Late.")
 
 def publication(message: Message) -> Publication:
     return Publication(key_of(message), encode(message), encoding_of(message), {})
+
+
+def links(*ids: tuple[str, int, str], area: str = "campus", whole: bool = True) -> Links:
+    """Return links of tracks in sessions of zeros: stream, track and the first digit of its global id."""
+    common = {"session": "0" * 32, "probability": 0.99, "kind": "overlap", "ended": False}
+    rows = [
+        LinkedObject(global_id=bytes.fromhex(digit * 32), stream=stream, object=number, **common)
+        for stream, number, digit in ids
+    ]
+    return Links(area=area, revision=1, stamp_ns=0, whole=whole, objects=tuple(rows))
 
 
 def plain(text: bytes | str) -> bytes:

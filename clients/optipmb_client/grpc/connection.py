@@ -9,6 +9,7 @@ from typing import Any, Final, Self
 import grpc
 from optipmb_schemas import (
     Keys,
+    Links,
     Message,
     Problem,
     ResetRequest,
@@ -83,7 +84,7 @@ class GrpcConnection:
         )
 
     def query(self, key: str, payload: bytes = b"", encoding: str = "", *, timeout: float = 2.0) -> tuple[Answer, ...]:
-        """Ask at the key of a query about a stream: its state, its parameters, a reset.
+        """Ask at the key of a query about a stream (its state, its parameters, a reset), or about the links of an area.
 
         Returns:
             The answer; an error as a problem; nothing when no service answers.
@@ -124,6 +125,10 @@ def _state(stream: str, _payload: bytes, _encoding: str) -> _Asked:
     return "GetState", pb.GetStateRequest(stream=stream), "state", SessionState
 
 
+def _links(place: str, _payload: bytes, _encoding: str) -> _Asked:
+    return "GetLinks", pb.GetLinksRequest(area=place.rpartition("/")[2]), "links", Links
+
+
 def _reset(stream: str, payload: bytes, encoding: str) -> _Asked:
     asked = decode(payload, ResetRequest, encoding=encoding) if payload else ResetRequest()
     return "Reset", pb.ResetRequest(stream=stream, close=asked.close), "state", SessionState
@@ -136,6 +141,7 @@ def _parameters(stream: str, payload: bytes, encoding: str) -> _Asked:
 
 
 _QUERIES: Final[Mapping[str, Callable[[str, bytes, str], _Asked]]] = {
+    "links": _links,
     "state": _state,
     "reset": _reset,
     "parameters": _parameters,

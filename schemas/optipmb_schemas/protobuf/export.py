@@ -25,6 +25,8 @@ from optipmb_schemas.messages import (
     Detections,
     Events,
     FieldOfView,
+    LinkedObject,
+    Links,
     Points,
     Pose,
     Relocation,
@@ -50,6 +52,8 @@ MODELS: Final[tuple[type[Message], ...]] = (
     SessionState,
     SessionParameters,
     SessionSummary,
+    LinkedObject,
+    Links,
 )
 """Models that have a protobuf message of the same name and fields."""
 

@@ -635,6 +635,50 @@ class GetStateResponse(_message.Message):
     state: SessionState
     def __init__(self, state: _Optional[_Union[SessionState, _Mapping]] = ...) -> None: ...
 
+class LinkedObject(_message.Message):
+    __slots__ = ("global_id", "stream", "session", "object", "probability", "kind", "ended")
+    GLOBAL_ID_FIELD_NUMBER: _ClassVar[int]
+    STREAM_FIELD_NUMBER: _ClassVar[int]
+    SESSION_FIELD_NUMBER: _ClassVar[int]
+    OBJECT_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    ENDED_FIELD_NUMBER: _ClassVar[int]
+    global_id: bytes
+    stream: str
+    session: str
+    object: int
+    probability: float
+    kind: str
+    ended: bool
+    def __init__(self, global_id: _Optional[bytes] = ..., stream: _Optional[str] = ..., session: _Optional[str] = ..., object: _Optional[int] = ..., probability: _Optional[float] = ..., kind: _Optional[str] = ..., ended: _Optional[bool] = ...) -> None: ...
+
+class Links(_message.Message):
+    __slots__ = ("area", "revision", "stamp_ns", "whole", "objects")
+    AREA_FIELD_NUMBER: _ClassVar[int]
+    REVISION_FIELD_NUMBER: _ClassVar[int]
+    STAMP_NS_FIELD_NUMBER: _ClassVar[int]
+    WHOLE_FIELD_NUMBER: _ClassVar[int]
+    OBJECTS_FIELD_NUMBER: _ClassVar[int]
+    area: str
+    revision: int
+    stamp_ns: int
+    whole: bool
+    objects: _containers.RepeatedCompositeFieldContainer[LinkedObject]
+    def __init__(self, area: _Optional[str] = ..., revision: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., whole: _Optional[bool] = ..., objects: _Optional[_Iterable[_Union[LinkedObject, _Mapping]]] = ...) -> None: ...
+
+class GetLinksRequest(_message.Message):
+    __slots__ = ("area",)
+    AREA_FIELD_NUMBER: _ClassVar[int]
+    area: str
+    def __init__(self, area: _Optional[str] = ...) -> None: ...
+
+class GetLinksResponse(_message.Message):
+    __slots__ = ("links",)
+    LINKS_FIELD_NUMBER: _ClassVar[int]
+    links: Links
+    def __init__(self, links: _Optional[_Union[Links, _Mapping]] = ...) -> None: ...
+
 class ResetRequest(_message.Message):
     __slots__ = ("stream", "close")
     STREAM_FIELD_NUMBER: _ClassVar[int]

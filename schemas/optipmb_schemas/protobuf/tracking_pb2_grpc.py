@@ -67,6 +67,11 @@ class TrackingServiceStub:
                 request_serializer=optipmb_dot_v1_dot_tracking__pb2.SetParametersRequest.SerializeToString,
                 response_deserializer=optipmb_dot_v1_dot_tracking__pb2.SetParametersResponse.FromString,
                 _registered_method=True)
+        self.GetLinks = channel.unary_unary(
+                '/optipmb.v1.TrackingService/GetLinks',
+                request_serializer=optipmb_dot_v1_dot_tracking__pb2.GetLinksRequest.SerializeToString,
+                response_deserializer=optipmb_dot_v1_dot_tracking__pb2.GetLinksResponse.FromString,
+                _registered_method=True)
         self.ListStreams = channel.unary_unary(
                 '/optipmb.v1.TrackingService/ListStreams',
                 request_serializer=optipmb_dot_v1_dot_tracking__pb2.ListStreamsRequest.SerializeToString,
@@ -132,6 +137,13 @@ class TrackingServiceServicer:
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def GetLinks(self, request, context):
+        """Which objects of the streams of an area are one, as `optipmb-service link` says.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def ListStreams(self, request, context):
         """The streams that are tracked now.
         """
@@ -186,6 +198,11 @@ def add_TrackingServiceServicer_to_server(servicer, server):
                     servicer.SetParameters,
                     request_deserializer=optipmb_dot_v1_dot_tracking__pb2.SetParametersRequest.FromString,
                     response_serializer=optipmb_dot_v1_dot_tracking__pb2.SetParametersResponse.SerializeToString,
+            ),
+            'GetLinks': grpc.unary_unary_rpc_method_handler(
+                    servicer.GetLinks,
+                    request_deserializer=optipmb_dot_v1_dot_tracking__pb2.GetLinksRequest.FromString,
+                    response_serializer=optipmb_dot_v1_dot_tracking__pb2.GetLinksResponse.SerializeToString,
             ),
             'ListStreams': grpc.unary_unary_rpc_method_handler(
                     servicer.ListStreams,
@@ -367,6 +384,33 @@ class TrackingService:
             '/optipmb.v1.TrackingService/SetParameters',
             optipmb_dot_v1_dot_tracking__pb2.SetParametersRequest.SerializeToString,
             optipmb_dot_v1_dot_tracking__pb2.SetParametersResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def GetLinks(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/optipmb.v1.TrackingService/GetLinks',
+            optipmb_dot_v1_dot_tracking__pb2.GetLinksRequest.SerializeToString,
+            optipmb_dot_v1_dot_tracking__pb2.GetLinksResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -65,8 +65,11 @@ class Caller:
 
     def may_read(self, pattern: str) -> None:
         """Raise NotAllowedError unless the caller may read all streams of a pattern."""
-        own = self._owns(pattern) or pattern in self.reads
-        self._check(self.name == ANYBODY or bool(self._role) or own, f"read {pattern}")
+        self._check(self.can_read(pattern), f"read {pattern}")
+
+    def can_read(self, pattern: str) -> bool:
+        """Return whether the caller may read all streams of a pattern."""
+        return self.name == ANYBODY or bool(self._role) or self._owns(pattern) or pattern in self.reads
 
     def may_command(self, stream: str) -> None:
         """Raise NotAllowedError unless the caller may reset a stream and set its parameters."""

@@ -282,7 +282,7 @@ class Bridge(Component):
         )
         self._reader = Reader(self._wish, settings.stale_s)
         self._client = client
-        self._feeds = Feeds(client, places_of(settings), Bounds(EVENTS, inf, EVENT_BYTES))
+        self._feeds = Feeds(client, client.keys, places_of(settings), Bounds(EVENTS, inf, EVENT_BYTES))
         self._opened: collections.deque[float] = collections.deque(maxlen=MANY)
         """Monotonic times of the last connections."""
         self._lost = 0

@@ -24,10 +24,11 @@ from optipmb_client.merging import FinalEventsOfStreams, remember
 from optipmb_schemas import json_form
 from optipmb_schemas.json_form import EVERYTHING, Selection
 
+from optipmb_service.edges.global_ids import GlobalIds
 from optipmb_service.zenoh.client import SharedSubscriptions, Turns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from optipmb_client.incoming import Answer, Arrival
     from optipmb_client.zenoh.handles import Dispatcher
@@ -59,6 +60,8 @@ BEGINNING: Final = "0"
 
 DIGITS: Final = 20
 PROBLEMS: Final = 16
+TRACKS: Final = ("/tracks", "/now")
+"""Ends of keys of tracks."""
 
 QUERY_S: Final = 2.0
 """Longest wait for the services."""
@@ -220,17 +223,26 @@ class Publication:
         topic: the last part of its key.
 
     Args:
+        ids: of linked tracks.
         live: whether it has just come, and is not from a cache.
     """
 
     def __init__(
-        self, key: str, payload: bytes, encoding: str, places: Mapping[str, Place], *, live: bool = True
+        self,
+        key: str,
+        payload: bytes,
+        encoding: str,
+        places: Mapping[str, Place],
+        ids: GlobalIds | None = None,
+        *,
+        live: bool = True,
     ) -> None:
         self.topic = key.rpartition("/")[2]
         self.payload = payload
         self.encoding = encoding
         self.arrived = time.monotonic() if live else None
         self._places = places
+        self._ids = ids
         self._texts: dict[Selection, bytes] = {}
 
     @cached_property
@@ -243,6 +255,11 @@ class Publication:
         return self._places.get(self.message.stream.partition("/")[0])
 
     @property
+    def global_ids(self) -> Sequence[str]:
+        """Global ids of its tracks, as far as they are known now."""
+        return () if self._ids is None else self._ids.of(self.message)
+
+    @property
     def age_s(self) -> float:
         """Seconds since it came, or since it was published if it is from a cache."""
         if self.arrived is not None:
@@ -253,7 +270,7 @@ class Publication:
     def tracks(self, selection: Selection, stale_s: float) -> bytes:
         """Return the selection of its tracks as JSON, with their age."""
         if selection not in self._texts:
-            self._texts[selection] = json_form.tracks_json(self.message, selection, self.place)
+            self._texts[selection] = json_form.tracks_json(self.message, selection, self.place, self.global_ids)
         age_s = self.age_s
         return json_form.with_age(self._texts[selection], age_s, stale=age_s > stale_s)
 
@@ -552,12 +569,19 @@ class Feeds:
 
     Args:
         session: on the network.
+        keys: of the network.
         places: of sites.
         bounds: of the events of each subscription.
     """
 
-    def __init__(self, session: Session, places: Mapping[str, Place], bounds: Bounds = BOUNDS) -> None:
+    def __init__(
+        self, session: Session, keys: schemas.Keys, places: Mapping[str, Place], bounds: Bounds = BOUNDS
+    ) -> None:
         self.session = session
+        self._keys = keys
+        self._ids = GlobalIds()
+        self._linking = threading.Lock()
+        self._links: Dispatcher | None = None
         self._places = places
         self._bounds = bounds
         self._turns = Turns(BURST, PERIOD_S)
@@ -573,6 +597,8 @@ class Feeds:
         """
         with contextlib.ExitStack() as joined:
             for key in keys:
+                if key.endswith(TRACKS):
+                    self._read_links()
                 shared = self._events if key.endswith("/events") else self._shared
                 joined.callback(shared.join(key, receive))
             return joined.pop_all().close
@@ -587,7 +613,7 @@ class Feeds:
         logs = {final: EventLog(self._bounds, final=final) for final in (True, False)}
 
         def read(one: Arrival) -> None:
-            publication = Publication(one.key, one.payload, one.encoding, self._places)
+            publication = Publication(one.key, one.payload, one.encoding, self._places, self._ids)
             if publication.message is not None:
                 for log in logs.values():
                     log.add(publication)
@@ -607,7 +633,8 @@ class Feeds:
         self._turns.take()
 
         def read(sample: Any) -> None:
-            receive(Publication(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), self._places))
+            content = sample.payload.to_bytes(), str(sample.encoding)
+            receive(Publication(str(sample.key_expr), *content, self._places, self._ids))
 
         return self.session.read_newest(key, read, most=1 if key.endswith("/detections") else WAITING)
 
@@ -617,8 +644,26 @@ class Feeds:
         Raises:
             TransportError: the network cannot be used.
         """
+        if key.endswith(TRACKS):
+            self._read_links()
         answers = self.session.query(f"{key}/@adv/**?_max={most}", timeout=QUERY_S)
-        return [Publication(one.key, one.payload, one.encoding, self._places, live=False) for one in answers if one.ok]
+        about = self._places, self._ids
+        return [Publication(one.key, one.payload, one.encoding, *about, live=False) for one in answers if one.ok]
+
+    def _read_links(self) -> None:
+        """Begin to read the links of all areas, with what is linked already, before the first tracks are read."""
+        with self._linking:
+            if self._links is not None:
+                return
+            self._links = self.session.read_newest(self._keys.all_links(), self._take_links, most=WAITING)
+            for answer in self.session.query(self._keys.all_links_query(), timeout=QUERY_S):
+                if answer.ok and (links := _valid(schemas.Links, answer)) is not None:
+                    self._ids.take(links)
+
+    def _take_links(self, sample: Any) -> None:
+        content = Publication(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), {})
+        if (links := _valid(schemas.Links, content)) is not None:
+            self._ids.take(links)
 
 
 async def listed(session: Session, keys: schemas.Keys, pattern: str) -> list[tuple[str, schemas.SessionSummary]]:

@@ -15,7 +15,7 @@ from optipmb_client.errors import ClientError
 from optipmb_schemas import Detections
 from optipmb_schemas.json_form import Selection, event_json, problem_json, tracks_json, zones_json
 from optipmb_service.settings import MqttSettings, Settings
-from watched import PROBLEM, STREAM, Session, events, plain, settled, tracks
+from watched import PROBLEM, STREAM, Session, events, links, plain, settled, tracks
 
 paho = pytest.importorskip("paho.mqtt.client")
 CallbackAPIVersion = pytest.importorskip("paho.mqtt.enums").CallbackAPIVersion
@@ -61,8 +61,11 @@ def session(monkeypatch: pytest.MonkeyPatch) -> Session:
 async def test_topics_are_keys_and_payloads_the_texts_of_readers(session: Session, versions: tuple[int, ...]) -> None:
     """Each with its quality of service; in MQTT 3.1.1 where the broker refuses 5.
 
-    The first of a topic is confirmed, so that it is known whether the broker takes it.
+    The first of a topic is confirmed, so that it is known whether the broker takes it. Linked tracks have their
+    global id.
     """
+    session.links = [links((STREAM, 1, "a"))]
+    ids = ["", "a" * 32]
     async with Broker(versions) as broker, bridging(session, broker, tracks_hz=0) as bridge:
         assert bridge.state == "degraded"
         await until(lambda: bridge.connected)
@@ -77,8 +80,8 @@ async def test_topics_are_keys_and_payloads_the_texts_of_readers(session: Sessio
         found = {(one.topic, one.qos, one.retain): plain(one.payload) for one in broker.messages}
         assert found == {
             (ALIVE, 1, True): b"1",
-            (f"{TOPIC}/tracks", 1, False): tracks_json(tracks(1), CONFIRMED),
-            (f"{TOPIC}/tracks", 0, False): tracks_json(tracks(2), CONFIRMED),
+            (f"{TOPIC}/tracks", 1, False): tracks_json(tracks(1), CONFIRMED, None, ids),
+            (f"{TOPIC}/tracks", 0, False): tracks_json(tracks(2), CONFIRMED, None, ids),
             (f"{TOPIC}/events", 1, False): event_json(events(1, 2))[1],
             (f"{TOPIC}/zones", 1, True): zones_json(events(1)),
             **{(f"{TOPIC}/problems", qos, False): problem_json(PROBLEM) for qos in (0, 1)},

@@ -38,6 +38,7 @@ from watched import (
     delivery,
     events,
     key_of,
+    links,
     plain,
     served,
     settled,
@@ -141,6 +142,24 @@ def test_all_topics_come_on_one_connection(session: Session, address: str) -> No
         assert next(found_texts) == zones_json(events(2))
     session.cache = [(key_of(events(4)), events(4))]
     assert get(address, f"zones?stream={STREAM}")[1] == [json.loads(zones_json(events(4)) or b"")]
+
+
+def test_linked_tracks_have_their_global_id(session: Session, address: str) -> None:
+    """As `Links` said before a reader came, and says since; a map has it, too, and no track that is not linked."""
+    message = tracks(3)
+    session.cache = [(key_of(message), message)]
+    session.links = [links((STREAM, 0, "a"), ("other/rig/a", 1, "a"))]
+    query = f"tracks?stream={ALL}&confirmed=0"
+
+    def found(query: str) -> list[str | None]:
+        return [one.get("global_id") for one in get(address, query)[1][0]["objects"]]
+
+    assert found(query) == ["a" * 32, None]
+    session.publish(links((STREAM, 1, "b"), whole=False))
+    assert found(query) == ["a" * 32, "b" * 32]
+    assert found(f"{query}&fields=speed") == [None, None]
+    session.publish(links((STREAM, 1, "c")), links((STREAM, 0, "d"), area="other"))
+    assert found(f"{query}&fields=global_id") == ["d" * 32, "c" * 32]
 
 
 def test_a_map_gets_the_newest_tracks_as_points(session: Session, watched: Watched) -> None:
@@ -424,7 +443,7 @@ STALE_S = 30.0
 def reader_of(session: Session, bounds: Bounds | None = None, stale_s: float = STALE_S, **wish: Any) -> Reader:
     """Return a reader that has joined."""
     network: Any = session
-    feeds = Feeds(network, {}, bounds or Bounds())
+    feeds = Feeds(network, KEYS, {}, bounds or Bounds())
     reader = Reader(Wish((ALL,), **wish), stale_s)
     keys = Wish((ALL,), **wish).keys(KEYS)
     feeds.join(keys, reader.receive)

@@ -370,7 +370,7 @@ def test_metrics_count_what_happened(tmp_path: Path) -> None:
 
 
 def test_viewers_use_up_no_keys() -> None:
-    """Repeated readers of a stream use two keys; a reader of ever new streams has to wait."""
+    """Repeated readers of a stream use two keys, and one for links; a reader of ever new streams has to wait."""
     with ServiceProcess("--http", "127.0.0.1:0", "--log-format", "json") as service:
         address = address_of(service)
         service.wait_ready()
@@ -388,7 +388,7 @@ def test_viewers_use_up_no_keys() -> None:
         before = declared()
         for _ in range(100):
             until(lambda: look("a/b/c") == http.client.OK, "a viewer is let in")
-        assert declared() == before + 2
+        assert declared() == before + 3
         refused = http.client.SERVICE_UNAVAILABLE
         until(lambda: look(f"a/b/stream-{next(NUMBERS)}") == refused, "no more streams are subscribed to")
         assert declared() <= before + BURST + 20

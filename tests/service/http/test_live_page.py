@@ -11,7 +11,8 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from optipmb_schemas import Detections, Pose, Tracks, encode_json
+from optipmb_schemas import Detections, Pose, Tracks, encode, encode_json, encoding_of
+from optipmb_service.edges.global_ids import GlobalIds
 from optipmb_service.edges.http import application, page
 from optipmb_service.edges.http.page import Live, live_frame
 from optipmb_service.edges.readers import Publication
@@ -20,7 +21,7 @@ from optipmb_service.zenoh import client
 from readers import texts
 from router import until
 from tracks_message import tracks_message
-from watched import KEYS, Session, Watched, asked, events, key_of, publication, served
+from watched import KEYS, Session, Watched, asked, events, key_of, links, publication, served
 
 from optipmb import Georeference
 
@@ -237,6 +238,16 @@ def test_a_frame_holds_what_is_drawn() -> None:
     assert json.loads(both)["detections"] == [[9.0, 25.0], [5.0, 1.0]]
     assert json.loads(both)["sensor"] == [10.0, 20.0, 1.571]
     assert live_frame(Publication(key_of(tracks(1)), b"\xc1", "", {})) is None
+
+
+def test_global_ids_are_drawn_where_they_are_known() -> None:
+    """By track, in the order of the tracks; nothing where none is linked."""
+    ids = GlobalIds()
+    message = tracks(1).model_copy(update={"session": "0" * 32})
+    given = (key_of(message), encode(message), encoding_of(message), {}, ids)
+    assert "global" not in json.loads(live_frame(Publication(*given)) or b"")
+    ids.take(links((STREAM, 5, "a")))
+    assert json.loads(live_frame(Publication(*given)) or b"")["global"] == ["a" * 32]
 
 
 def test_a_pose_at_the_origin_is_no_sensor() -> None:

@@ -1,21 +1,27 @@
 """Links between streams: the role of the service, as a process."""
 
+import json
 import signal
 import time
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from gateway import GatewayProcess
 from optipmb_client import Connection, Publisher, Subscriber, linked_objects
 from optipmb_client.errors import ServiceUnavailable
+from optipmb_client.grpc import GrpcConnection
 from optipmb_schemas import Keys, Links, Tracks, decode, encode, encoding_of
 from optipmb_tools.cli import run
+from optipmb_tools.run.service_process import free_port
 from service_process import ServiceProcess
 from tracks_message import tracks_message
 
 STREAMS = ("west/node/lidar", "east/node/lidar")
 OBJECTS = 6
+HTTP = f"127.0.0.1:{free_port()}"
 BEGIN_NS = 1_700_000_000_000_000_000
 PATIENCE_S = 60.0
 
@@ -23,7 +29,7 @@ PATIENCE_S = 60.0
 @pytest.fixture(scope="module")
 def services() -> Iterator[ServiceProcess]:
     """Two services, of which the first is the router."""
-    with ServiceProcess("--instance", "one", "--profile", "generic") as one:
+    with ServiceProcess("--instance", "one", "--profile", "generic", "--http", HTTP) as one:
         one.wait_ready()
         two = ("--connect", one.endpoint, "--instance", "two", "--profile", "generic")
         with ServiceProcess(*two, listen=False) as other:
@@ -85,7 +91,7 @@ def until_linked(connection: Connection) -> dict[tuple[str, str, int], bytes]:
 
 
 def test_killed_and_started_again(services: ServiceProcess, settings: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Links survive a kill; a consumer counts the objects of two streams, each once."""
+    """Links survive a kill; a consumer counts the objects of two streams once each; other readers get the same ids."""
     with Connection(services.endpoint) as connection, Subscriber("*/*/*", connection=connection) as subscriber:
         publishers = [Publisher(one, frame="world", connection=connection) for one in STREAMS]
         with link(services, settings) as process:
@@ -106,6 +112,13 @@ def test_killed_and_started_again(services: ServiceProcess, settings: Path, caps
                 if len(shown) == len(STREAMS) and tracks.seq == 74:
                     break
             ids = linked_objects(connection, "campus")
+            with GatewayProcess(services.endpoint) as gateway:
+                gateway.wait_ready()
+                with GrpcConnection((gateway.address,)) as remote:
+                    assert linked_objects(remote, "campus") == ids
+            with urllib.request.urlopen(f"http://{HTTP}/api/v1/tracks?stream=*/*/*") as answer:
+                read = [one["global_id"] for frame in json.load(answer) for one in frame["objects"]]
+            assert sorted(read) == sorted(one.hex() for one in ids.values())
             assert run(["links", "campus", "--connect", services.endpoint]) == 0
             lines = capsys.readouterr().out.splitlines()
             distinct = {ids.get(track, track) for each in shown.values() for track in each}

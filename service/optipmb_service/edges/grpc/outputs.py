@@ -123,6 +123,16 @@ async def get_state(call: Call) -> None:
     await _answer(call, pb.GetStateResponse(state=await _asked(call, key, None, schemas.SessionState)))
 
 
+async def get_links(call: Call) -> None:
+    """Ask which objects of streams that the caller may read are one."""
+    asked = await call.request(pb.GetLinksRequest)
+    links = await _asked(call, call.gateway.client.keys.links_query(asked.area), None, schemas.Links)
+    readable = [one for one in links.objects if call.caller.can_read(one.stream)]
+    links.ClearField("objects")
+    links.objects.extend(readable)
+    await _answer(call, pb.GetLinksResponse(links=links))
+
+
 async def reset(call: Call) -> None:
     """Restart a session, or end it."""
     asked = await call.request(pb.ResetRequest)

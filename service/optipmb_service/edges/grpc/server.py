@@ -44,6 +44,7 @@ METHODS: Final[dict[str, Callable[[Call], Awaitable[None]]]] = {
     "SubscribeEvents": outputs.subscribe_events,
     "QueryTracks": outputs.query_tracks,
     "GetState": outputs.get_state,
+    "GetLinks": outputs.get_links,
     "Reset": outputs.reset,
     "SetParameters": outputs.set_parameters,
     "ListStreams": outputs.list_streams,

@@ -235,7 +235,7 @@ class Readers:
         """
         session = self.session()
         if self._feeds is None or self._feeds.session is not session:
-            self._feeds = Feeds(session, self._places)
+            self._feeds = Feeds(session, self.keys, self._places)
         return self._feeds
 
     async def caller(self, connection: HTTPConnection) -> Caller:

@@ -183,6 +183,8 @@ def live_frame(tracks: Publication, *detections: Publication, place: Place | Non
         "sensor": sensor,
         "detections": found,
     }
+    if ids := tracks.global_ids:
+        frame["global"] = [ids[row] for row in np.flatnonzero(confirmed)[:_MOST].tolist()]
     if place is not None:
         places = place(message.center[confirmed][:_MOST], message.yaw[confirmed][:_MOST])
         rows = np.stack([np.round(one, digits) for one, digits in zip(places, (9, 9, 3, 1), strict=True)], axis=1)

@@ -13,6 +13,7 @@ const ID = 0, LABEL = 1, X = 2, Y = 3, LENGTH = 4, WIDTH = 5, YAW = 6, VX = 7, V
 const ROWS = 1000; // streams in the list: a table of ten thousand takes a browser seconds, each time
 const ENDS = 5000; // objects whose last places are kept
 
+const globalId = (track) => ((frame.global || [])[frame.tracks.indexOf(track)] || "").slice(0, 8); // as `optipmb links` writes it
 const object = (track) => (track[OBJECT] >= 0 ? track[OBJECT] : track[ID]);
 const at = (id) => document.getElementById(id);
 const made = (tag, text) => Object.assign(document.createElement(tag), { textContent: text });
@@ -353,7 +354,7 @@ function box(track) {
   pen.lineWidth = 3;
   pen.setLineDash([]);
   pen.strokeStyle = ink.veil;
-  const name = bold || view.scale > NAMED ? `${object(track)} ${frame.labels[track[LABEL]]}` : object(track);
+  const name = bold || view.scale > NAMED ? `${object(track)} ${frame.labels[track[LABEL]]} ${globalId(track)}`.trim() : object(track);
   const wide = pen.measureText(name).width, [cx, cy] = toScreen(x, y);
   const free = ([px, py]) => !names.some(([x, y, w]) => Math.abs(x - px) < (w + wide) / 2 && Math.abs(y - py) < 12);
   const places = [ // above, below, right, left: all beside its box, or none
@@ -389,7 +390,7 @@ function tell() {
   at("details").hidden = !track;
   if (!track) return;
   const rows = {
-    "track": track[ID], ...(track[OBJECT] >= 0 ? { "object": track[OBJECT] } : {}), "class": frame.labels[track[LABEL]],
+    "track": track[ID], ...(track[OBJECT] >= 0 ? { "object": track[OBJECT] } : {}), ...(globalId(track) ? { "global id": globalId(track) } : {}), "class": frame.labels[track[LABEL]],
     "existence": track[EXISTENCE].toFixed(3), "score": track[SCORE].toFixed(2),
     "speed": `${Math.hypot(track[VX], track[VY]).toFixed(1)} m/s`, "x, y": `${track[X].toFixed(1)}, ${track[Y].toFixed(1)} m`,
     "faces": `${(track[YAW] * 180 / Math.PI).toFixed(0)}° at ${(100 * track[FACING]).toFixed(1)} %`,
