@@ -30,6 +30,8 @@ WAIT_NS: Final = 10**9
 """How far the furthest stream may be ahead of a common time before that is decided without the others."""
 FRESH_NS: Final = 10**9
 """Age at which a track that is not detected, or a message, does not count any more."""
+LONG_NS: Final = 2 * 10**9
+"""Times of tracks that are longer are told from no others: a track is fresh, and an object has begun, for less."""
 CLOCK_NS: Final = 2 * 10**9
 """Largest difference of a stream's clock from most other clocks."""
 STUCK_NS: Final = 5 * 10**9
@@ -49,15 +51,15 @@ class Look(NamedTuple):
     stamp_ns: int
     session: int
     object: Index  # (N,)
-    id: Index
+    id: Index | None  # where it is not `object`
     place: Array
     velocity: Singles
     covariance: Singles  # (N, 3)
     variance: Singles  # (N,) of the velocity
     size: Singles
     kind: NDArray[np.int8]
-    age_ns: Index
-    since_ns: Index
+    age_ns: NDArray[np.int32]  # up to `LONG_NS`
+    since_ns: NDArray[np.int32]
     vectors: Singles | None
 
 
@@ -184,15 +186,15 @@ class LinkInputs:
             message.stamp_ns,
             stream.session_number,
             own[rows],
-            message.id[rows],
+            None if np.array_equal(own[rows], message.id[rows]) else message.id[rows],
             frame.turned(message.center[rows, :2]) + np.array((frame.x, frame.y)),
             frame.turned(message.velocity[rows]).astype(np.float32),
             turned.astype(np.float32),
             np.clip(unsure, 1e-3, 1e4).astype(np.float32),
             np.log(message.size[rows]).astype(np.float32),
             kinds_of(message.labels)[message.label[rows]].astype(np.int8),
-            (1e9 * np.minimum(message.age[rows], 1e6)).astype(np.int64),
-            (1e9 * np.minimum(message.time_since_detection[rows], 1e6)).astype(np.int64),
+            np.minimum(1e9 * message.age[rows], LONG_NS).astype(np.int32),
+            np.minimum(1e9 * message.time_since_detection[rows], LONG_NS).astype(np.int32),
             None if vectors is None else vectors[rows],
         )
         if stream.add(look):

@@ -211,7 +211,7 @@ class Linker:
             if look is None:
                 continue
             ahead = stamp_ns - look.stamp_ns
-            keep = np.flatnonzero(look.since_ns + ahead < FRESH_NS)
+            keep = np.flatnonzero(look.since_ns < FRESH_NS - ahead)
             for old, new in self.objects.continued(look, keep):
                 self._merge(old, new)
             numbers = self.objects.numbers(stream, look, keep)

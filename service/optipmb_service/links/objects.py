@@ -26,13 +26,13 @@ APPEARANCE: Final = 2
 NONE: Final = 3
 
 OBJECT: Final = np.dtype([
-    ("number", "i8"), ("session", "i8"), ("stream", "i8"), ("object", "i8"), ("global", "u8", 2), ("shown", "u8", 2),
-    ("first_ns", "i8"), ("last_ns", "i8"), ("begin", "f8", 2), ("end", "f8", 2), ("velocity", "f4", 2),
-    ("variance", "f4"), ("size", "f4", 3), ("probability", "f4"), ("kind", "i1"), ("how", "i1"), ("decided", "i1"),
-    ("known", "i1"), ("ended", "i1"), ("told", "i1"),
+    ("number", "i8"), ("session", "i8"), ("object", "i8"), ("global", "u8", 2), ("first_ns", "i8"), ("last_ns", "i8"),
+    ("begin", "f8", 2), ("end", "f8", 2), ("velocity", "f4", 2), ("variance", "f4"), ("size", "f4", 3),
+    ("probability", "f4"), ("stream", "i1"), ("kind", "i1"), ("how", "i1"), ("decided", "i1"), ("known", "i1"),
+    ("ended", "i1"), ("told", "i1"),
 ])  # fmt: skip
 """An object of a session: ends in the plane of the area; `known`: it began while it was looked for; `told`: bits of
-kind of the last publication (1: any, 2: the end); `how`: of a pair, or `NONE`."""
+kind of the last publication, of the present id (1: any, 2: the end); `how`: of a pair, or `NONE`."""
 
 
 class Objects:
@@ -83,6 +83,8 @@ class Objects:
         A track of an object that is not known yet becomes that object.
         """
         found: list[tuple[int, int]] = []
+        if look.id is None:
+            return found
         for one, identity in zip(look.object[keep].tolist(), look.id[keep].tolist(), strict=True):
             if one == identity or (old := self._known.pop((look.session, identity), None)) is None:
                 continue
@@ -105,13 +107,13 @@ class Objects:
                 new.append(at)
             found[at] = number
         if new:
-            rows = keep[new]
+            rows, stamp_ns = keep[new], np.int64(look.stamp_ns)
             more = np.zeros(len(new), OBJECT)
             more["number"], more["session"], more["stream"] = found[new], look.session, stream.number
             more["object"] = look.object[rows]
-            more["first_ns"] = look.stamp_ns - np.where(look.age_ns[rows] < START_NS, look.age_ns[rows], 0)
-            more["last_ns"] = look.stamp_ns - look.since_ns[rows]
-            seconds = (look.stamp_ns - more["first_ns"]) * 1e-9
+            more["first_ns"] = stamp_ns - np.where(look.age_ns[rows] < START_NS, look.age_ns[rows], 0)
+            more["last_ns"] = stamp_ns - look.since_ns[rows]
+            seconds = (stamp_ns - more["first_ns"]) * 1e-9
             more["begin"] = look.place[rows] - seconds[:, None] * look.velocity[rows]
             more["end"], more["velocity"] = look.place[rows], look.velocity[rows]
             more["variance"], more["size"] = look.variance[rows], look.size[rows]
@@ -126,7 +128,7 @@ class Objects:
     def update(self, look: Look, keep: Index, numbers: Index) -> tuple[Index, Index]:
         """Take the newest ends from rows of a message; return the numbers and rows of detected objects."""
         at = self.at(numbers)
-        self.table["last_ns"][at] = np.maximum(self.table["last_ns"][at], look.stamp_ns - look.since_ns[keep])
+        self.table["last_ns"][at] = np.maximum(self.table["last_ns"][at], np.int64(look.stamp_ns) - look.since_ns[keep])
         seen = look.since_ns[keep] == 0
         at, rows = at[seen], keep[seen]
         self.table["end"][at], self.table["velocity"][at] = look.place[rows], look.velocity[rows]
@@ -153,7 +155,7 @@ class Objects:
             local[at] = frame._replace(yaw=-frame.yaw).turned(place[at] - (frame.x, frame.y))
         return End(
             own["number"],
-            own["stream"],
+            own["stream"].astype(np.int64),
             np.array([streams[one].frame.plane for one in own["stream"].tolist()], np.int64),
             own["kind"].astype(np.int64),
             place,

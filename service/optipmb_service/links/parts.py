@@ -39,6 +39,7 @@ def settle(objects: Objects, pairs: Table) -> tuple[Index, Index]:
     again[order[1:]] = (claim[order[1:]] == claim[order[:-1]]).all(axis=1)
     for n in np.flatnonzero(again).tolist():
         claim[n] = objects.id_of(int(oldest[n]))
+    changed = (own["global"] != claim[part]).any(axis=1)
     own["global"] = claim[part]
     order = np.argsort(pairs["probability"][linked], kind="stable")
     own["how"], own["probability"] = NONE, 1.0
@@ -48,8 +49,8 @@ def settle(objects: Objects, pairs: Table) -> tuple[Index, Index]:
     size = np.bincount(part)[part]
     state = 1 + 2 * own["ended"]
     told = (size > 1) | (own["told"] > 0)
-    new = np.flatnonzero(told & ((own["told"] != state) | (own["global"] != own["shown"]).any(axis=1)))
-    own["shown"][new], own["told"][new] = own["global"][new], state[new]
+    new = np.flatnonzero(told & (changed | (own["told"] != state)))
+    own["told"][new] = state[new]
     return part, new
 
 
