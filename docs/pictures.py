@@ -18,7 +18,7 @@ from optipmb_tools.run.rejoining import RejoinOptions, tracklets
 from optipmb_tools.run.tracking import track_whole
 
 import optipmb
-from optipmb.joining.rejoin import motion_of, motion_score
+from optipmb.joining.evidence import motion_of, motion_score
 from optipmb.world.zones import Zone, ZoneState, observe
 
 if TYPE_CHECKING:

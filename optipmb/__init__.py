@@ -24,7 +24,8 @@ from optipmb.detectors import from_detector
 from optipmb.filter.detection_probability import points_in_boxes
 from optipmb.filter.geometry import bev_iou
 from optipmb.filter.paths import PredictedPaths, predict_tracks
-from optipmb.joining.rejoin import Passage, Rejoin
+from optipmb.joining.decision import Rejoin
+from optipmb.joining.places import Passage
 from optipmb.model.class_names import class_indices, common_name
 from optipmb.model.density import Bernoullis, Density, Poissons, bytes_of, columns_in, columns_of, density_of
 from optipmb.model.errors import DensityError, EffortError, FrameError, OptipmbError, ParameterError

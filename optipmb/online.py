@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
     from optipmb.cameras.ground_camera import GroundCamera
     from optipmb.filter.paths import PredictedPaths
-    from optipmb.joining.rejoin import Rejoin
+    from optipmb.joining.decision import Rejoin
     from optipmb.model.density import Density
     from optipmb.model.frame import FieldOfView, Frame, PointCloud
     from optipmb.model.parameters import Parameters

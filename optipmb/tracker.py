@@ -21,7 +21,7 @@ from optipmb.filter.preprocess import preprocess
 from optipmb.filter.undetected import update_undetected, with_measurement_births
 from optipmb.filter.unknown_heading import all_measured, measured_bits
 from optipmb.filter.update import first_detected_states, ukf_updates
-from optipmb.joining.rejoin import Kinds, Rejoin, rejoin_tracks
+from optipmb.joining.decision import Kinds, Rejoin, rejoin_tracks
 from optipmb.learning.self_calibration import calibrated, followed
 from optipmb.learning.sensor_motion import follow_sensor
 from optipmb.model.density import (
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb.filter.paths import PredictedPaths
-    from optipmb.joining.rejoin import Joined
+    from optipmb.joining.decision import Joined
     from optipmb.model.frame import Frame
     from optipmb.model.rows import Array, Columns, Index
     from optipmb.model.table import Classes

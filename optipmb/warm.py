@@ -16,7 +16,9 @@ from numba.core.dispatcher import Dispatcher
 from optipmb import compiled
 from optipmb.filter.geometry import bev_iou
 from optipmb.filter.paths import predict_tracks
-from optipmb.joining.rejoin import Kinds, Rejoin, match, pair_scores
+from optipmb.joining.decision import Kinds, Rejoin
+from optipmb.joining.evidence import pair_scores
+from optipmb.joining.matching import match
 from optipmb.learning.hindsight import later_velocities
 from optipmb.model.errors import EffortError
 from optipmb.model.frame import FieldOfView, PointCloud, Pose, make_frame

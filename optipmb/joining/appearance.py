@@ -1,7 +1,7 @@
 """Appearance of tracks: vectors of a re-identification model, and the distances between vectors of one object.
 
-A detection may bring a vector e. Where tracks are joined over gaps (`optipmb.joining.rejoin`), the vector of a track is
-the direction of
+A detection may bring a vector e. Where tracks are joined over gaps (`optipmb.joining.decision`), the vector of a track
+is the direction of
 
     a(t) = sum_k exp(-(t - t_k) / `MEMORY_S`) e_k / |e_k|
 
@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from optipmb.model.rows import Array, Index
 
     Singles = NDArray[np.float32]
+    Flags = NDArray[np.bool_]
 
 MEMORY_S: Final = 1.0
 APART_NS: Final = 500_000_000
@@ -159,8 +160,83 @@ def count_distance(vectors: Vectors, i: int, j: int, kind: int) -> None:
 
 
 @kernel
+def _rows_with(
+    live: tuple[Index, Flags], old: tuple[Singles, Singles, Index], identity: Index
+) -> tuple[Index, Index, Flags, tuple[Singles, Singles, Index]]:
+    """Return ids (U,), row of each detected track, whether tracks are decided, and their arrays with rows for new ones.
+
+    Args:
+        live: (N,) ids of the live tracks, ascending, and which of them are decided.
+        old: `total`, `first` and `stamp_ns` of these.
+        identity: (K,) ids, ascending, of the tracks that are detected.
+    """
+    before, width = live[0].shape[0], old[0].shape[1]
+    most = before + identity.shape[0]
+    ids, row, decided = np.empty(most, np.int64), np.empty(identity.shape[0], np.int64), np.zeros(most, np.bool_)
+    total, first = np.zeros((most, width), np.float32), np.zeros((most, width), np.float32)
+    stamps = np.full((most, 3), -1)
+    u = n = 0
+    for k in range(identity.shape[0] + 1):
+        while n < before and (k == identity.shape[0] or live[0][n] <= identity[k]):
+            ids[u], decided[u] = live[0][n], live[1][n]
+            for s in range(3):
+                stamps[u, s] = old[2][n, s]
+            for s in range(width):
+                total[u, s], first[u, s] = old[0][n, s], old[1][n, s]
+            u, n = u + 1, n + 1
+        if k < identity.shape[0]:
+            if u == 0 or ids[u - 1] != identity[k]:
+                ids[u], u = identity[k], u + 1
+            row[k] = u - 1
+    return ids[:u], row, decided[:u], (total[:u], first[:u], stamps[:u])
+
+
+@kernel
+def _add(arrays: tuple[Singles, Singles, Index], n: int, decided: bool, vector: Singles, stamp_ns: int) -> None:
+    """Add the vector of a detection to row `n`."""
+    total, first, stamps = arrays
+    if decided and stamps[n, _FIRST] < 0 <= stamps[n, _SEEN]:
+        for s in range(total.shape[1]):
+            first[n, s] = total[n, s]
+        stamps[n, _FIRST] = stamps[n, _COUNTED] = stamps[n, _SEEN]
+    square = 0.0
+    for s in range(vector.shape[0]):
+        square += float(vector[s]) ** 2
+    left, scale = math.exp((stamps[n, _SEEN] - stamp_ns) * _NS / MEMORY_S), 1.0 / math.sqrt(square)
+    for s in range(vector.shape[0]):
+        total[n, s] = left * total[n, s] + scale * vector[s]
+    stamps[n, _SEEN] = stamp_ns
+
+
+@kernel
+def _count(arrays: tuple[Singles, Singles, Index], rows: Index, kind: Index, counts: Array, stamp_ns: int) -> None:
+    """Count the distances of rows (K,) of decided tracks from what they were, and from each other."""
+    total, first, stamps = arrays
+    for a in range(rows.shape[0]):
+        n, c = rows[a], kind[a]
+        since_ns = stamp_ns - stamps[n, _FIRST]
+        if stamps[n, _FIRST] < 0 or since_ns > LATEST_NS or stamp_ns - stamps[n, _COUNTED] < APART_NS:
+            continue
+        stamps[n, _COUNTED] = stamp_ns
+        d = distance(first[n], total[n], math.exp(-since_ns * _NS / MEMORY_S))
+        if math.isnan(d):
+            continue
+        counts[c, 0, bin_of(d)] += 1.0
+        others = 0
+        for step in range(1, rows.shape[0]):
+            other = (a + step) % rows.shape[0]
+            if kind[other] == c and others < OTHERS:
+                counts[c, 1, bin_of(distance(first[n], total[rows[other]], 0.0))] += 1.0
+                others += 1
+        for s in range(2):
+            if counts[c, s].sum() >= MOST_COUNTS:
+                for at in range(DISTANCES):
+                    counts[c, s, at] *= 0.5
+
+
+@kernel
 def see(
-    live: tuple[Index, NDArray[np.bool_]],
+    live: tuple[Index, Flags],
     old: tuple[Singles, Singles, Index, Array],
     detected: tuple[Index, Index, Index],
     vectors: Singles,
@@ -179,64 +255,15 @@ def see(
         The ids (U,) of both, and the same arrays after the frame with rows for these.
     """
     identity, kind, source = detected
-    before, width = live[0].shape[0], old[0].shape[1]
-    most = before + identity.shape[0]
-    ids, row, decided = np.empty(most, np.int64), np.empty(identity.shape[0], np.int64), np.zeros(most, np.bool_)
-    total, first = np.zeros((most, width), np.float32), np.zeros((most, width), np.float32)
-    stamps, counts = np.full((most, 3), -1), old[3].copy()
-    u = n = 0
-    for k in range(identity.shape[0] + 1):
-        while n < before and (k == identity.shape[0] or live[0][n] <= identity[k]):
-            ids[u], decided[u] = live[0][n], live[1][n]
-            for s in range(3):
-                stamps[u, s] = old[2][n, s]
-            for s in range(width):
-                total[u, s], first[u, s] = old[0][n, s], old[1][n, s]
-            u, n = u + 1, n + 1
-        if k < identity.shape[0]:
-            if u == 0 or ids[u - 1] != identity[k]:
-                ids[u], u = identity[k], u + 1
-            row[k] = u - 1
-    known = np.empty(row.shape[0], np.int64)
-    count = 0
+    ids, row, decided, arrays = _rows_with(live, old[:3], identity)
+    counts, known, count = old[3].copy(), np.empty(row.shape[0], np.int64), 0
     for k in range(row.shape[0]):
-        n, m, square = row[k], source[k], 0.0
-        if vectors.shape[0] == 0 or math.isnan(vectors[m, 0]):
-            continue
-        if decided[n] and stamps[n, _FIRST] < 0 <= stamps[n, _SEEN]:
-            for s in range(total.shape[1]):
-                first[n, s] = total[n, s]
-            stamps[n, _FIRST] = stamps[n, _COUNTED] = stamps[n, _SEEN]
-        for s in range(vectors.shape[1]):
-            square += float(vectors[m, s]) ** 2
-        left, scale = math.exp((stamps[n, _SEEN] - stamp_ns) * _NS / MEMORY_S), 1.0 / math.sqrt(square)
-        for s in range(vectors.shape[1]):
-            total[n, s] = left * total[n, s] + scale * vectors[m, s]
-        stamps[n, _SEEN] = stamp_ns
-        if decided[n]:
-            known[count], count = k, count + 1
-    for a in range(count):
-        k = known[a]
-        n, c = row[k], kind[k]
-        since_ns = stamp_ns - stamps[n, _FIRST]
-        if stamps[n, _FIRST] < 0 or since_ns > LATEST_NS or stamp_ns - stamps[n, _COUNTED] < APART_NS:
-            continue
-        stamps[n, _COUNTED] = stamp_ns
-        d = distance(first[n], total[n], math.exp(-since_ns * _NS / MEMORY_S))
-        if math.isnan(d):
-            continue
-        counts[c, 0, bin_of(d)] += 1.0
-        others = 0
-        for step in range(1, count):
-            other = known[(a + step) % count]
-            if kind[other] == c and others < OTHERS:
-                counts[c, 1, bin_of(distance(first[n], total[row[other]], 0.0))] += 1.0
-                others += 1
-        for s in range(2):
-            if counts[c, s].sum() >= MOST_COUNTS:
-                for at in range(DISTANCES):
-                    counts[c, s, at] *= 0.5
-    return ids[:u], total[:u], first[:u], stamps[:u], counts
+        if vectors.shape[0] > 0 and not math.isnan(vectors[source[k], 0]):
+            _add(arrays, row[k], decided[row[k]], vectors[source[k]], stamp_ns)
+            if decided[row[k]]:
+                known[count], count = k, count + 1
+    _count(arrays, row[known[:count]], kind[known[:count]], counts, stamp_ns)
+    return ids, arrays[0], arrays[1], arrays[2], counts
 
 
 def seen(

@@ -1,4 +1,4 @@
-"""State of the joining of tracks (`optipmb.joining.rejoin`), as arrays."""
+"""State of the joining of tracks (`optipmb.joining.decision`), as arrays."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@
     state, events = observe(zones, state, stamp_ns, tracks, labels)
 
 `observe` is pure, as the step of the tracker is. Only frames in which a track was detected move it. Events of a track
-come when it is confirmed. Where tracks are joined over gaps (`optipmb.joining.rejoin`), they come when its object is
+come when it is confirmed. Where tracks are joined over gaps (`optipmb.joining.decision`), they come when its object is
 decided. Then a track goes on with the visits of the object's track before, as if that had been detected again.
 """
 

@@ -20,21 +20,21 @@ from scipy.linalg import expm
 from scipy.optimize import Bounds, LinearConstraint, milp
 
 from optipmb import Parameters, generic_parameters
-from optipmb.joining import rejoin
+from optipmb.joining import evidence
 from optipmb.model.lost_objects import Tracklets
 
 Array = NDArray[np.float64]
 GENERIC = generic_parameters(gaps.CLASSES, 0.1)
 
 
-CAR = np.array(rejoin.motion_of("car"))
+CAR = np.array(evidence.motion_of("car"))
 
 
 def score_of(seconds: float, **known: Any) -> float:
     """Return the score of a gap of an object that moves along at 5 m/s."""
     values = {"offset": (0.0, 0.0), "later": (np.nan, np.nan), "later_variance": np.nan} | known
     reach = 35.0 * seconds + 3.0
-    return rejoin.motion_score(
+    return evidence.motion_score(
         values["offset"], (5.0, 0.0), 0.04, values["later"], values["later_variance"], seconds, reach, CAR
     )
 
@@ -43,9 +43,9 @@ def score_of(seconds: float, **known: Any) -> float:
 @pytest.mark.parametrize("axis", [0, 1])
 def test_motion_models_are_those_of_their_differential_equations(seconds: float, axis: int) -> None:
     """Factors and covariances equal the matrix exponentials of Van Loan (1978)."""
-    motion = rejoin.motion_of("car")
+    motion = evidence.motion_of("car")
     noise = (motion.keeps_along, motion.keeps_across)[axis], (motion.wanders_along, motion.wanders_across)[axis]
-    models = rejoin.keeps(seconds, 0.04, noise[0]), rejoin.wanders(seconds, 0.04, noise[1], motion.memory)
+    models = evidence.keeps(seconds, 0.04, noise[0]), evidence.wanders(seconds, 0.04, noise[1], motion.memory)
     for model, rate, density in zip(
         models, (0.0, 1.0 / motion.memory), (noise[0] ** 2, 2.0 * noise[1] ** 2 / motion.memory), strict=True
     ):
@@ -61,8 +61,8 @@ def test_motion_models_are_those_of_their_differential_equations(seconds: float,
 def test_the_density_of_places_is_that_of_sampled_paths() -> None:
     """Of paths that are simulated step by step, as many end in a region as the density says."""
     rng, count, steps, seconds = np.random.default_rng(1), 20_000, 60, 3.0
-    motion, dt, farthest = rejoin.motion_of("car"), seconds / 60, 35.0 * seconds + 3.0
-    mode = rng.choice(4, count, p=rejoin.WEIGHTS[1])
+    motion, dt, farthest = evidence.motion_of("car"), seconds / 60, 35.0 * seconds + 3.0
+    mode = rng.choice(4, count, p=evidence.WEIGHTS[1])
     place, speed = np.zeros((count, 2)), np.array((5.0, 0.0)) + 0.2 * rng.standard_normal((count, 2))
     keeps = np.array((motion.keeps_along, motion.keeps_across))
     wanders = np.array((motion.wanders_along, motion.wanders_across))
@@ -258,9 +258,9 @@ def test_sizes_of_an_object_agree() -> None:
     size = np.log(gaps.SIZES[0]) + 0.15 * rng.standard_normal((200, 3))
     count, mean, square = np.full(3, 200.0), size.mean(axis=0), 200.0 * size.var(axis=0)
     others = size[0] + 0.01, size[0] + 0.5, np.full(3, np.nan)
-    same, other, unknown = (rejoin.size_score(size[0], one, count, mean, square, 2) for one in others)
-    assert 0.0 < same <= rejoin.SIZE_BOUNDS[1]
-    assert other == rejoin.SIZE_BOUNDS[0]
+    same, other, unknown = (evidence.size_score(size[0], one, count, mean, square, 2) for one in others)
+    assert 0.0 < same <= evidence.SIZE_BOUNDS[1]
+    assert other == evidence.SIZE_BOUNDS[0]
     assert unknown == 0.0
 
 

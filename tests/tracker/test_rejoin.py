@@ -12,7 +12,7 @@ from scipy.stats import lognorm
 
 import optipmb
 from optipmb import OnlineTracker, ParameterError, Passage, Rejoin, Relocation, Tracker, generic_parameters
-from optipmb.joining import rejoin
+from optipmb.joining import places, records
 from optipmb.model.lost_objects import Returns, Tracklets
 
 GENERIC = generic_parameters(gaps.CLASSES, 0.1)
@@ -123,21 +123,21 @@ def test_learned_scores_are_a_mixture_of_returns() -> None:
     returns.end[:, 0] += 20.0
     returns.seconds[:], returns.speed[:], returns.weight[:] = (15, 22, 19, 19, 19), 1.2, (0.3, 0.9, 0.6, 1.0, 1.0)
     returns.speed[2] = np.nan
-    one, others = rejoin.tracklets_in(tracks.words), rejoin.returns_in(returns.words)
-    score, share = rejoin.learned_score(one, 0, one, 1, 0, others)
+    one, others = records.tracklets_in(tracks.words), records.returns_in(returns.words)
+    score, share = places.learned_score(one, 0, one, 1, 0, others)
     speeds, variances = np.array((1.1, np.hypot(0.9, 0.1))), np.array((0.01, 0.02))
-    weights = 1.0 / (variances + (rejoin.PACE * speeds) ** 2)
+    weights = 1.0 / (variances + (places.PACE * speeds) ** 2)
     speed = (weights * speeds).sum() / weights.sum()
-    deviation = np.hypot(1.0 / np.sqrt(weights.sum()) / speed, rejoin.PACE)
+    deviation = np.hypot(1.0 / np.sqrt(weights.sum()) / speed, places.PACE)
     near = returns.weight[:3] * np.exp(-0.5 * (returns.start[:3] ** 2).sum(axis=1) / 9.0)
     square = ((returns.end[:3] - tracks.begin[1]) ** 2).sum(axis=1)
     median = returns.seconds[:3] * np.array((1.2 / speed, 1.2 / speed, 1.0))
-    spread = np.array((deviation, deviation, 2.0 * rejoin.PACE))
+    spread = np.array((deviation, deviation, 2.0 * places.PACE))
     density = lognorm.pdf(19.0, spread, scale=median) * np.exp(-0.5 * square / 9.0) / (18.0 * np.pi)
-    assert share == pytest.approx(rejoin.LEARNED * near.sum() / (near.sum() + rejoin.FIRST_RETURNS))
+    assert share == pytest.approx(places.LEARNED * near.sum() / (near.sum() + places.FIRST_RETURNS))
     assert score == pytest.approx(np.log(0.5 * share * (near * density).sum() / near.sum()))
     tracks.begin[1] = 3.0, 4.0
-    assert rejoin.learned_score(one, 0, one, 1, 0, others) == (-np.inf, 0.0)
+    assert places.learned_score(one, 0, one, 1, 0, others) == (-np.inf, 0.0)
 
 
 def test_passages_are_learned() -> None:

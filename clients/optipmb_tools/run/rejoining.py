@@ -1,4 +1,4 @@
-"""Joining of the tracks of a recording over gaps, by the scores and the matching of `optipmb.joining.rejoin`.
+"""Joining of the tracks of a recording over gaps, by the scores and the matching of `optipmb.joining`.
 
 Beginnings before and after a track count for the rate of new objects, with the probabilities to be new that `TURNS`
 turns estimate. Objects in view when a recording starts have not begun then, and count nothing.
@@ -13,19 +13,12 @@ from optipmb_client.errors import UsageError
 from optipmb_schemas import Tracks
 from optipmb_schemas.json_form import shown
 
-from optipmb import ParameterError, Parameters
-from optipmb.joining import rejoin
-from optipmb.joining.rejoin import (
-    FIT_NS,
-    KERNEL_M,
-    LEAST_FIT_S,
-    QUANTUM,
-    Kinds,
-    match,
-    motion_of,
-    pair_scores,
-    size_score,
-)
+from optipmb import ParameterError, Parameters, Rejoin
+from optipmb.joining.decision import Kinds
+from optipmb.joining.evidence import QUANTUM, motion_of, pair_scores, size_score
+from optipmb.joining.following import FIT_NS, LEAST_FIT_S
+from optipmb.joining.matching import match
+from optipmb.joining.places import KERNEL_M
 from optipmb.model.lost_objects import SETTLES_NS, Tracklets
 from optipmb_tools.geometry import Floats, Ints
 from optipmb_tools.results import stacked
@@ -47,7 +40,7 @@ class RejoinOptions:
 
     def __post_init__(self) -> None:
         try:
-            rejoin.Rejoin(self.gap_s, self.min_probability)
+            Rejoin(self.gap_s, self.min_probability)
         except ParameterError as error:
             option = "--rejoin" if error.path.endswith("gap_s") else "--min-probability"
             raise UsageError(f"{option}: expected {error.expected}, received {error.received}") from error
@@ -147,7 +140,7 @@ def _pairs(found: Tracklets, later: Ints, kinds: Kinds, gap_s: float) -> tuple[I
 
 
 def _size_scores(size: Floats, kind: Ints, before: Ints, after: Ints) -> Floats:
-    """Return `optipmb.joining.rejoin.size_score` of pairs (P,) by the sizes (N, 3) of all tracks."""
+    """Return `optipmb.joining.evidence.size_score` of pairs (P,) by the sizes (N, 3) of all tracks."""
     count, mean, square = np.zeros((3, int(kind.max(initial=-1)) + 1, 3))
     for axis, one in np.ndindex(3, len(count)):
         own = size[:, axis][(kind == one) & ~np.isnan(size[:, axis])]

@@ -4,7 +4,7 @@ An object that ended at e and one that began at y, a time T later, are one with 
 
     P p(T, y | e) / lambda(y)
 
-p is the sum of the motion of joining over gaps (`optipmb.joining.rejoin`, where the world frames can be compared), of
+p is the sum of the motion of joining over gaps (`optipmb.joining.evidence`, where the world frames can be compared), of
 declared passages, and of what beginnings have taught: each of them counts for all ends it may continue, with its odds,
 at the places of both and the time between them, and that times the speed, the more the steadier each of the two was.
 lambda is the rate of new objects, in which each beginning counts with the probability that it was new. Kernels of
@@ -17,7 +17,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from optipmb.joining.rejoin import KERNEL_M, QUANTUM, REACH_M, RETURNS, SHORTEST_S, Motion, match, pair_scores
+from optipmb.joining.evidence import QUANTUM, REACH_M, RETURNS, SHORTEST_S, Motion, pair_scores
+from optipmb.joining.matching import match
+from optipmb.joining.places import KERNEL_M
 from optipmb.model.lost_objects import Tracklets
 from optipmb_service.links.kinds import AREA_M2, MOTION
 from optipmb_service.links.places import area_m2, inside

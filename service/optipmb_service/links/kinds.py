@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from optipmb.joining.rejoin import Declared, Kinds, motion_of
+from optipmb.joining.decision import Kinds
+from optipmb.joining.evidence import motion_of
+from optipmb.joining.places import DeclaredPlaces
 from optipmb.model.class_names import common_name
 
 if TYPE_CHECKING:
@@ -22,7 +24,7 @@ MOTION: Final = Kinds(
     np.array([motion_of(name) for name in KINDS]),
     np.arange(len(KINDS)),
     np.full(len(KINDS), AREA_M2),
-    Declared.of(None),
+    DeclaredPlaces.of(),
 )
 
 

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from optipmb.joining.rejoin import QUANTUM, match
+from optipmb.joining.evidence import QUANTUM
+from optipmb.joining.matching import match
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -12,7 +12,7 @@ from optipmb_service.session.outputs import TrackedFrame
 from optipmb_service.session.timeline import FrameId
 
 import optipmb
-from optipmb.joining.rejoin import Joined
+from optipmb.joining.decision import Joined
 
 FRAME = FrameId(b"0" * 16, 1, 2)
 PARAMETERS = optipmb.load_profile("generic")
