@@ -49,6 +49,7 @@ from optipmb_tools.run.tracking import tracker_frame
 
 import optipmb
 from optipmb import generic_parameters
+from optipmb.joining.decision import Kinds
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -103,7 +104,7 @@ class How:
     def joins(self, tracks: dict[int, Tracks], parameters: Parameters) -> tuple[Tracklets, tuple[Ints, Ints, Floats]]:
         """Return the confirmed tracks and the joins."""
         found = tracklets(tracks, parameters.labels)
-        return found, decided(tracks, found) if self.online else joins(found, parameters, RejoinOptions.gap_s)
+        return found, decided(tracks, found) if self.online else joins(found, Kinds.of(parameters), RejoinOptions.gap_s)
 
     def numbers(self, tracks: dict[int, Tracks], parameters: Parameters) -> Ints:
         """Return the object of each row, -1 of one that has none."""

@@ -10,7 +10,7 @@ It is a thin object over the pure `Tracker.step`, for those who want no densitie
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from enum import Enum
 from html import escape
@@ -25,6 +25,7 @@ from optipmb.detectors import forms_of, from_detector, on_host
 from optipmb.learning.doubts import EXPECTED as SIZES
 from optipmb.learning.doubts import SizeCheck
 from optipmb.learning.velocity_check import EXPECTED, VelocityCheck
+from optipmb.model.attributes import shown_of
 from optipmb.model.class_names import class_indices
 from optipmb.model.errors import FrameError
 from optipmb.model.frame import Pose, make_frame
@@ -62,9 +63,9 @@ ALIASES: Final = MappingProxyType({
 WITHOUT: Final = MappingProxyType({"z": 0.0, "h": 1.5, "score": 1.0, "label": "object"})
 """Values of the columns that may be missing, as in the tables of `optipmb track`."""
 BOXES: Final = ("center", "score", "label")
-OTHERS: Final = ("size", "yaw", "velocity", "position_covariance", "embedding")
+OTHERS: Final = ("size", "yaw", "velocity", "position_covariance", "embedding", "attributes")
 KNOWN: Final = (*BOXES, *OTHERS, *(part for _, parts in FLAT for part in parts), *ALIASES)
-OF_PIXELS: Final = ("box", "foot", "score", "label", "embedding")
+OF_PIXELS: Final = ("box", "foot", "score", "label", "embedding", "attributes")
 KNOWN_PIXELS: Final = (*OF_PIXELS, *(part for _, parts in PIXELS for part in parts), *ALIASES)
 SHOWN_ROWS: Final = 10
 """Tracks that the representation of `OnlineTracks` lists."""
@@ -99,6 +100,11 @@ class OnlineTracks:
         measured: (N,) uint8, the known parts of each track: 1 the heading, 2 the size, 4 the height, added up.
         object: (N,) int64 id of the first track of the object, -1 while that is not decided; None without `rejoin`.
         object_probability: (N,) that all joins of the object are right, 1 without a join; None without `rejoin`.
+        candidate: (N,) int64 earlier object that fitted best when the track was decided, -1: none did; None without
+            `rejoin`.
+        candidate_probability: (N,) that the track continues an earlier object, NaN where none fitted; below
+            `Rejoin.min_probability` it was not joined; None without `rejoin`.
+        attributes: by name the texts (N,) with most evidence, "" where unknown, and their shares of it (N,).
 
     The other attributes are the columns of `optipmb.Tracks`.
     """
@@ -129,6 +135,9 @@ class OnlineTracks:
     sensor_motion: Array | None = None
     object: Index | None = None
     object_probability: Array | None = None
+    candidate: Index | None = None
+    candidate_probability: Array | None = None
+    attributes: Mapping[str, tuple[NDArray[np.str_], Array]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.tracks)
@@ -186,6 +195,7 @@ class OnlineTracks:
             **{column: getattr(self, column) for column in plain},
             **({} if self.object is None else {"object": self.object}),
             **({} if self.object_probability is None else {"object_probability": self.object_probability}),
+            **{f"attributes.{name}": texts for name, (texts, _) in self.attributes.items()},
         }
 
     def to_arrow(self) -> pa.Table:
@@ -382,8 +392,9 @@ class OnlineTracker:
                 `y`, `z`; `size` (M, 3) or `l`, `w`, `h` or `length`, `width`, `height`; `yaw` or `heading` (M,) rad;
                 `score` or `confidence` (M,) in (0, 1]; `class`, `label`, `name`, `category` or `type` (M,): class
                 names, one name for all, or their places in the profile; `velocity` (M, 2) or `vx`, `vy`, m/s, NaN where
-                unknown; `position_covariance` (M, 3, 3), m^2, and `embedding` (M, E), appearance, likewise. Sizes,
-                headings and `z` may be NaN or absent, unknown; but with a size a missing column `z` is 0 and `h` 1.5 m.
+                unknown; `position_covariance` (M, 3, 3), m^2, and `embedding` (M, E), appearance, likewise;
+                `attributes` (M,), texts by name, each alone or with a score, as `{"plate": ("AB 12", 0.8)}`. Sizes,
+                headings and `z` may be NaN or absent, unknown; but with a size a missing `z` is 0 and `h` 1.5 m.
                 Without `score` it is 1. None: nothing was detected.
             t: time of the frame: seconds, or a date (of pandas too; UTC where it has no zone); or
             stamp_ns: nanoseconds.
@@ -392,7 +403,7 @@ class OnlineTracker:
             field_of_view: where the sensor detects objects; outside it they are neither detected nor missed. With a
                 camera the default is the field of view of its image.
             camera: of pixel boxes: `box` (M, 4) or `x1`, `y1`, `x2`, `y2`, or the points `foot` (M, 2) or `u`, `v` on
-                which objects stand, with classes and scores, and `embedding`.
+                which objects stand, with classes and scores, `embedding` and `attributes`.
             embedding_model: model and version of `embedding`, the same as in `Rejoin`; required with it.
             arrays: the same columns as arguments.
 
@@ -432,7 +443,8 @@ class OnlineTracker:
             **columns,
         )
         if row is not None:
-            frame = replace(frame, source=row[frame.source])
+            texts = frame.readings and frame.readings._replace(row=row[frame.readings.row])
+            frame = replace(frame, source=row[frame.source], readings=texts)
         self._doubt(frame)
         result = self._tracker.step(self.density, frame)
         self.density = result.density
@@ -457,7 +469,17 @@ class OnlineTracker:
             measured=np.full(len(tracks), 7, np.uint8) if result.measured is None else result.measured,
             object=None if result.joined is None else result.joined.object,
             object_probability=None if result.joined is None else result.joined.probability,
+            candidate=None if result.joined is None else result.joined.candidate,
+            candidate_probability=None if result.joined is None else result.joined.candidate_probability,
+            attributes=self._texts(result),
         )
+
+    def _texts(self, result: StepResult) -> Mapping[str, tuple[NDArray[np.str_], Array]]:
+        """Return the attributes of the tracks."""
+        if result.density.attributes is None:
+            return {}
+        found = shown_of(result.density.attributes, result.tracks.id)
+        return {name: (np.array(texts, np.str_), share) for name, (texts, share) in found.items()}
 
     def _given(
         self, boxes: Any, arrays: dict[str, Any], camera: GroundCamera | None, pose: Pose | None
@@ -470,11 +492,13 @@ class OnlineTracker:
         if camera is None:
             return _columns(boxes, arrays), None, 0
         pixels = _pixels(boxes, arrays)
-        looks = pixels.pop("embedding", None)
+        looks, texts = pixels.pop("embedding", None), pixels.pop("attributes", None)
         columns = self._on_ground(camera, pose, pixels)
         row, outside = columns.pop("row"), sum(columns.pop("left_out").values())
         if looks is not None:
             columns["embedding"] = np.asarray(looks)[row]
+        if texts is not None:
+            columns["attributes"] = [texts[one] for one in row.tolist()]
         return columns, row, outside
 
     def _doubt(self, frame: Frame) -> None:
@@ -565,7 +589,9 @@ def _columns(boxes: Any, arrays: Mapping[str, ArrayLike]) -> dict[str, Any]:
         elif any(part in given for part in parts):
             columns[name] = _stacked(given, parts)
     columns |= {
-        name: given[name] for name in ("yaw", "score", "position_covariance", "embedding", "label") if name in given
+        name: given[name]
+        for name in ("yaw", "score", "position_covariance", "embedding", "attributes", "label")
+        if name in given
     }
     if "center" not in columns:
         raise FrameError("center", "the columns x and y, or center", f"the columns {', '.join(given)}")

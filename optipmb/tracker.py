@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -24,6 +24,7 @@ from optipmb.filter.update import first_detected_states, ukf_updates
 from optipmb.joining.decision import Kinds, Rejoin, rejoin_tracks
 from optipmb.learning.self_calibration import calibrated, followed
 from optipmb.learning.sensor_motion import follow_sensor
+from optipmb.model.attributes import read
 from optipmb.model.density import (
     NO_FRAME,
     OBJECT,
@@ -49,6 +50,7 @@ if TYPE_CHECKING:
 
     from optipmb.filter.paths import PredictedPaths
     from optipmb.joining.decision import Joined
+    from optipmb.model.attributes import Attributes
     from optipmb.model.frame import Frame
     from optipmb.model.rows import Array, Columns, Index
     from optipmb.model.table import Classes
@@ -302,6 +304,12 @@ class Tracker:
             own = followed(scores, predicted, poisson, misses, after, z, chosen, moment, table)
         posterior = Density(moment.stamp_ns, next_id, objects, poisson, labels, misses, pi, own, sensor)
 
+        if frame.readings is not None or density.attributes is not None:
+            hit = after.measurement >= 0
+            detection = frame.source[chosen[after.measurement[hit]]]
+            texts = read(density.attributes, frame.readings, objects.id[hit], detection)
+            posterior = replace(posterior, attributes=texts)
+
         # Track extraction
         shown = objects.words, posterior.missed_from_ns, after.measurement, tuple(z), tuple(moment)
         words, rows = extract(*shown, modules.ote, table.classes)
@@ -312,6 +320,8 @@ class Tracker:
             posterior, tracks = joined.density, joined.tracks
             objects, pi = posterior.bernoulli, posterior.class_probability
             rows = np.searchsorted(objects.id, tracks.id)
+        if posterior.attributes is not None:
+            posterior = replace(posterior, attributes=_of_present(posterior.attributes, posterior))
         paths = paths_of(tracks, self._horizons, table) if self._horizons.size else None
         pi = None if pi is None else pi[rows]
         removed, repaired = (frame.score.shape[0], below_score, suppressed), repaired + after.repaired
@@ -330,3 +340,10 @@ class Tracker:
         period = self._table.period
         dt = period if density.stamp_ns == NO_FRAME else (frame.stamp_ns - density.stamp_ns) * 1e-9
         return Moment(frame.stamp_ns, density.stamp_ns, dt, period)
+
+
+def _of_present(attributes: Attributes, density: Density) -> Attributes | None:
+    """Return the attributes of the objects of a density and of lost ones; None: there are none."""
+    lost = () if density.rejoining is None else density.rejoining.lost.id
+    rows = np.isin(attributes.id, np.concatenate((density.bernoulli.id, lost)))
+    return attributes.take(rows) if rows.any() else None

@@ -19,6 +19,7 @@ from optipmb.filter.paths import predict_tracks
 from optipmb.joining.decision import Kinds, Rejoin
 from optipmb.joining.evidence import pair_scores
 from optipmb.joining.matching import match
+from optipmb.joining.places import with_declared
 from optipmb.learning.hindsight import later_velocities
 from optipmb.model.errors import EffortError
 from optipmb.model.frame import FieldOfView, PointCloud, Pose, make_frame
@@ -139,6 +140,7 @@ def _run() -> Parameters:
 def _run_rejoining(parameters: Parameters) -> None:
     empty, kinds = np.zeros(0, np.int64), Kinds.of(parameters)
     pair_scores(np.zeros(0), empty, empty, kinds.kind, kinds.motion, 60.0)
+    with_declared(np.zeros(0), np.zeros(0), empty, empty, kinds.declared)
     match(empty, empty, np.zeros(0), np.zeros(0, np.bool_), 0)
     tracker = Tracker(parameters, rejoin=Rejoin(embedding_model="any"))
     boxes: dict[str, Any] = {"label": [0], "center": [[0.0, 0.0, 0.0]], "score": [0.9]}

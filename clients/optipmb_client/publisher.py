@@ -13,12 +13,12 @@ import operator
 import secrets
 import threading
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
-from optipmb_schemas import PREFIX, Detections, FieldOfView, Keys, MessageError, Points, Pose, Relocation
+from optipmb_schemas import PREFIX, Attribute, Detections, FieldOfView, Keys, MessageError, Points, Pose, Relocation
 from optipmb_schemas.arrays import ArrayLike, numeric
 
 from optipmb_client.links import Link, linked
@@ -129,6 +129,7 @@ class Publisher:
         relocation: PoseLike | None = None,
         embedding: ArrayLike | None = None,
         embedding_model: str | None = None,
+        attributes: Sequence[Mapping[str, str | tuple[str, float]]] | None = None,
     ) -> int:
         """Publish the detections of one sensor frame, and its point cloud where there is one.
 
@@ -158,6 +159,8 @@ class Publisher:
                 The service moves its tracks so, and they keep their ids.
             embedding: (M, E), appearance of the objects, E from 2 to 512; a row of NaN where it is unknown.
             embedding_model: Model and version that `embedding` is of, at most 64 characters; required with it.
+            attributes: Of each object up to 8 texts by name, as `{"plate": "AB 12"}`, or each with a score in (0, 1].
+                None: none are known.
 
         Returns:
             The sequence number of the frame.
@@ -195,6 +198,7 @@ class Publisher:
                 position_covariance=None if position_covariance is None else _array(position_covariance, 3, 3),
                 embedding=None if embedding is None else _array(embedding, 2),
                 embedding_model=embedding_model,
+                attributes=None if attributes is None else _attributes(attributes, len(index)),
             )
             payload = self._detections.pack(message)
             attachment = attachment_of(current_traceparent())
@@ -238,6 +242,17 @@ class Publisher:
                 xyz=numeric.finite(_array(points, 3)),
             )
         )
+
+
+def _attributes(given: Sequence[Mapping[str, str | tuple[str, float]]], count: int) -> tuple[Attribute, ...]:
+    if len(given) != count:
+        raise MessageError("invalid_value", "attributes", f"{count} maps, one for each object", str(len(given)))
+    return tuple(
+        Attribute(row=row, name=name, text=text, score=score)
+        for row, one in enumerate(given)
+        for name, value in one.items()
+        for text, score in [(value, 1.0) if isinstance(value, str) else value]
+    )
 
 
 def _labelled(label: Any, labels: Sequence[str] | None) -> tuple[tuple[str, ...], Any]:

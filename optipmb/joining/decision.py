@@ -26,7 +26,16 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.joining.appearance import NOTHING, Vectors, aligned, appearance_score, count_distance, seen
-from optipmb.joining.evidence import QUANTUM, count_sizes, log_sum, motion_of, pair_score, size_score
+from optipmb.joining.evidence import (
+    QUANTUM,
+    KnownTexts,
+    attribute_score,
+    count_sizes,
+    log_sum,
+    motion_of,
+    pair_score,
+    size_score,
+)
 from optipmb.joining.following import PLACE_COLUMNS, TRACKLETS, follow
 from optipmb.joining.matching import match
 from optipmb.joining.places import (
@@ -44,6 +53,7 @@ from optipmb.joining.places import (
     with_returns,
 )
 from optipmb.joining.records import beginnings_in, returns_in, selected, statistics_in, tracklets_in
+from optipmb.model.attributes import Attributes, gathered
 from optipmb.model.errors import ParameterError
 from optipmb.model.frame import LONGEST_MODEL
 from optipmb.model.lost_objects import Beginnings, Lost, Places, Rejoining, Returns, Statistics, Tracklets
@@ -174,7 +184,7 @@ def _scores(
     due: Flags,
     moment: tuple[int, float],
     kinds: Columns,
-    vectors: Vectors,
+    looks: tuple[Vectors, KnownTexts],
 ) -> tuple[Array, Array]:
     """Return s_ij (E, M) of ends and beginnings, NaN or -inf where they are not joined, and its part by appearance.
 
@@ -187,11 +197,12 @@ def _scores(
         due: (M,) those on which to decide.
         moment: stamp and `Rejoin.gap_s`.
         kinds: the fields of `Kinds`.
-        vectors: of the tracks and of the lost objects.
+        looks: vectors and attributes of the tracks and of the lost objects.
     """
     (lost, live, begun, returns, known), (motion, kind, area, plan), (stamp_ns, gap_s) = tables, kinds, moment
     declared, many = DeclaredPlaces(*plan), lost.id.shape[0]
-    score, looks = np.full((ends.shape[0], young.shape[0]), math.nan), np.zeros((ends.shape[0], young.shape[0]))
+    score, appeared = np.full((ends.shape[0], young.shape[0]), math.nan), np.zeros((ends.shape[0], young.shape[0]))
+    vectors, texts = looks
     wanted, used, grows = due.copy(), np.zeros(ends.shape[0], np.bool_), True
     news = np.zeros(area.shape[0])
     for n in range(begun.id.shape[0]):
@@ -219,20 +230,22 @@ def _scores(
                     value = log_sum(value + math.log1p(-share), way)
                     sizes = known.count[c], known.mean[c], known.square[c]
                     value += size_score(table.size[n], live.size[k], sizes[0], sizes[1], sizes[2], LEAST_SIZES)
+                    if texts.id.shape[0] > 0:
+                        value += attribute_score(texts, table.id[n], live.id[k])
                     if vectors.total.shape[1] > 0:
-                        looks[at, m] = appearance_score(vectors, table.id[n], live.id[k], c)
-                if value + max(looks[at, m], 0.0) > least_log and not in_exit(declared, table.end[n]):
+                        appeared[at, m] = appearance_score(vectors, table.id[n], live.id[k], c)
+                if value + max(appeared[at, m], 0.0) > least_log and not in_exit(declared, table.end[n]):
                     if math.isnan(log_rate):
                         around = beginnings_around(begun, c, live.id[k], live.begin[k, 0], live.begin[k, 1])
                         log_rate = math.log(0.5 * (everywhere + around) / seconds)
-                    value = round((value + looks[at, m] - log_rate) / QUANTUM) * QUANTUM
+                    value = round((value + appeared[at, m] - log_rate) / QUANTUM) * QUANTUM
                 else:
                     value = -math.inf
                 score[at, m] = value
                 if value > 0.0:
                     grows |= not (wanted[m] and used[at])
                     wanted[m] = used[at] = True
-    return score, looks
+    return score, appeared
 
 
 @kernel
@@ -282,6 +295,12 @@ def _positive(score: Array) -> tuple[Index, Index, Array]:
 
 
 @kernel
+def _name_candidate(live: Tracklets, k: int, table: Tracklets, row: int, odds: float) -> None:
+    """Write the earlier object that fits live row `k` best, and the probability that it continues one by its odds."""
+    live.candidate[k], live.candidate_probability[k] = table.object[row], 1.0 / (1.0 + math.exp(-odds))
+
+
+@kernel
 def _continue(live: Tracklets, k: int, table: Tracklets, row: int, probability: float) -> None:
     """Let live row `k` go on with the object of a row before the gap."""
     live.object[k], live.probability[k] = table.object[row], table.probability[row] * probability
@@ -300,7 +319,7 @@ def decide(
     stamp_ns: int,
     kinds: Columns,
     limits: tuple[float, float],
-    vectors: Vectors,
+    looks: tuple[Vectors, KnownTexts],
 ) -> tuple[Array, Array, Array, Index]:
     """Decide on new tracks: write their objects to the words of the live tracks, and sizes to the words of the classes.
 
@@ -311,7 +330,7 @@ def decide(
         stamp_ns: of the frame.
         kinds: the fields of `Kinds`.
         limits: `Rejoin.gap_s` and `min_probability`.
-        vectors: of the tracks and of the lost objects.
+        looks: vectors and attributes of the tracks and of the lost objects.
 
     Returns:
         The words of the lost objects, the beginnings and the returns, and the rows of live tracks that were joined:
@@ -322,21 +341,29 @@ def decide(
     kind, many = kinds[1], lost.id.shape[0]
     ends = _candidates(live, lost, stamp_ns, young.shape[0])
     tables = lost, live, beginnings_in(begun_words), returns_in(return_words), known
-    score, looks = _scores(tables, ends, young, due, (stamp_ns, limits[0]), kinds, vectors)
-    if vectors.total.shape[1] > 0:
-        _count_gaps(score - looks, (lost, live), ends, young, due, kind, vectors)
+    score, appeared = _scores(tables, ends, young, due, (stamp_ns, limits[0]), kinds, looks)
+    if looks[0].total.shape[1] > 0:
+        _count_gaps(score - appeared, (lost, live), ends, young, due, kind, looks[0])
     decided = np.flatnonzero(due)
     return_words = with_returns(return_words, (lost, live), ends, young[decided], score[:, decided], stamp_ns, kind)
     before, after, gain = _positive(score)
     taken, margin, odds = match(before, after, gain, due, ends.shape[0])
     kept, gone = np.ones(many, np.bool_), np.zeros(live.id.shape[0], np.bool_)
-    for k in young[decided]:
+    for m in decided:
+        k, best = young[m], -1
         count_sizes(known, kind[live.label[k]], live.size[k])
         live.object[k] = live.id[k]
-    for n in np.flatnonzero(taken):
-        probability = 1.0 / (1.0 + math.exp(-margin[n]))
-        if due[after[n]] and probability >= limits[1]:
-            k, row = young[after[n]], ends[before[n]]
+        for at in range(ends.shape[0]):
+            if score[at, m] > (-math.inf if best < 0 else score[best, m]):
+                best = at
+        if best >= 0:
+            table, row = (lost, ends[best]) if ends[best] < many else (live, ends[best] - many)
+            _name_candidate(live, k, table, row, odds[m] if odds[m] > -math.inf else score[best, m])
+    for n in np.flatnonzero(taken & due[after]):
+        probability, k, row = 1.0 / (1.0 + math.exp(-margin[n])), young[after[n]], ends[before[n]]
+        table, at = (lost, row) if row < many else (live, row - many)
+        _name_candidate(live, k, table, at, margin[n])
+        if probability >= limits[1]:
             if row < many:
                 kept[row] = False
                 _continue(live, k, lost, row, probability)
@@ -375,15 +402,17 @@ def _within_limits(lost_words: Array, stamp_ns: int, gap_s: float, most: int) ->
 
 
 @kernel
-def _objects_of(identity: Index, live: Tracklets) -> tuple[Index, Array]:
-    """Return object and probability of tracks by their ids, ascending; -1 and 1 of those that are not live."""
+def _objects_of(identity: Index, live: Tracklets) -> tuple[Index, Array, Index, Array]:
+    """Return object, candidate and their probabilities of tracks by their ids, ascending; -1 of what is not live."""
     objects, probability, k = np.full(identity.shape[0], -1), np.ones(identity.shape[0]), 0
+    candidate, chance = np.full(identity.shape[0], -1), np.full(identity.shape[0], math.nan)
     for n in range(identity.shape[0]):
         while k < live.id.shape[0] and live.id[k] < identity[n]:
             k += 1
         if k < live.id.shape[0] and live.id[k] == identity[n]:
             objects[n], probability[n] = live.object[k], live.probability[k]
-    return objects, probability
+            candidate[n], chance[n] = live.candidate[k], live.candidate_probability[k]
+    return objects, probability, candidate, chance
 
 
 @kernel
@@ -392,8 +421,8 @@ def advance(
     moment: tuple[Array, Array, int],
     kinds: Columns,
     limits: tuple[float, float, float, int],
-    vectors: Columns,
-) -> tuple[Array, Array, Array, Array, Array, Array, Index, Array, Index, int, int]:
+    looks: tuple[Columns, Columns],
+) -> tuple[Array, Array, Array, Array, Array, Array, Index, Array, Index, Array, Index, int, int]:
     """Return the words of `Rejoining` after a frame.
 
     Args:
@@ -401,12 +430,12 @@ def advance(
         moment: words of the tracks of the frame and of the objects of the density, and the stamp.
         kinds: the fields of `Kinds`.
         limits: the first fields of `Rejoin`.
-        vectors: the fields of `Vectors`.
+        looks: the fields of `Vectors` and of `KnownTexts`.
 
     Returns:
-        The words; object and probability (N,) of the tracks of the frame; ids of the objects that were joined while
-        they were not detected; and the numbers of joins and of lost objects that were dropped because there were too
-        many.
+        The words; object and probability, candidate and its probability (N,) of the tracks of the frame; ids of the
+        objects that were joined while they were not detected; and the numbers of joins and of lost objects that were
+        dropped because there were too many.
     """
     live_words, place_words, lost_words, begun_words, return_words, class_words = given
     gap_s, least, decide_s, most = limits
@@ -427,7 +456,7 @@ def advance(
             stamp_ns,
             kinds,
             (gap_s, least),
-            Vectors(*vectors),
+            (Vectors(*looks[0]), KnownTexts(*looks[1])),
         )
         joined = np.sum((had < 0) & (live.object >= 0) & (live.object != live.id))
         if rows.shape[0]:
@@ -438,9 +467,8 @@ def advance(
             place_words = selected(place_words, others, PLACE_COLUMNS)
             live = tracklets_in(live_words)
     lost_words, dropped = _within_limits(lost_words, stamp_ns, gap_s, most)
-    objects, probability = _objects_of(tracks_in(track_words).id, live)
     words = live_words, place_words, lost_words, begun_words, return_words, class_words
-    return *words, objects, probability, ends, joined, dropped
+    return *words, *_objects_of(tracks_in(track_words).id, live), ends, joined, dropped
 
 
 class Joined(NamedTuple):
@@ -451,6 +479,8 @@ class Joined(NamedTuple):
         tracks: of the frame, without these objects.
         object: (N,) int64 id of the first track of the object, -1 while that is not decided.
         probability: (N,) that all joins of the object are right, 1 without a join.
+        candidate: (N,) int64 earlier object that fitted best when the track was decided, -1: none did.
+        candidate_probability: (N,) that the track continues an earlier object; NaN where none fitted.
         joins: of the frame.
         dropped: lost objects that were dropped because there were too many.
     """
@@ -459,6 +489,8 @@ class Joined(NamedTuple):
     tracks: Tracks
     object: Index
     probability: Array
+    candidate: Index
+    candidate_probability: Array
     joins: int
     dropped: int
 
@@ -500,12 +532,12 @@ def rejoin_tracks(
     if looks is not None:
         appearance, ids = looks
         vectors = Vectors(ids, appearance.total, state.lost.id, appearance.lost, appearance.counts)
-    *words, objects, probability, ended, joins, dropped = advance(
+    *words, objects, probability, candidate, chance, ended, joins, dropped = advance(
         given,
         (tracks.words, density.bernoulli.words, density.stamp_ns),
         (*kinds[:3], tuple(kinds.declared)),
         limits,
-        tuple(vectors),
+        (tuple(vectors), tuple(KnownTexts.of(density.attributes))),
     )
     live, places, lost, begun, returns, known = words
     after = Rejoining(
@@ -518,12 +550,32 @@ def rejoin_tracks(
     )
     if looks is not None:
         after = replace(after, appearance=aligned(*looks, state.lost, after.live, after.lost))
-    density = replace(density, rejoining=after)
+    texts = None if density.attributes is None else _of_objects(density.attributes, state, after.live)
+    density = replace(density, rejoining=after, attributes=texts)
     if len(ended):
         stays = ~np.isin(tracks.id, ended)
         density, tracks = _without(density, ended), tracks.take(stays)
-        objects, probability = objects[stays], probability[stays]
-    return Joined(density, tracks, objects, probability, joins, dropped)
+        objects, probability, candidate, chance = objects[stays], probability[stays], candidate[stays], chance[stays]
+    return Joined(density, tracks, objects, probability, candidate, chance, joins, dropped)
+
+
+def _of_objects(attributes: Attributes, before: Rejoining, live: Tracklets) -> Attributes:
+    """Return the attributes with those of lost objects for the tracks that continue them now."""
+    last = {
+        number: row
+        for rows in (before.lost, before.live)
+        for number, row in zip(rows.object.tolist(), rows.id.tolist(), strict=True)
+    }
+    joined = (live.object >= 0) & (live.object != live.id)
+    own = {
+        last[number]: row
+        for number, row in zip(live.object[joined].tolist(), live.id[joined].tolist(), strict=True)
+        if number in last
+    }
+    identity = np.array([own.get(one, one) for one in attributes.id.tolist()], np.int64)
+    if np.array_equal(identity, attributes.id):
+        return attributes
+    return gathered(Attributes.empty(), identity, attributes.name, attributes.text, attributes.evidence)
 
 
 def _without(density: Density, identity: Index) -> Density:

@@ -20,9 +20,11 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.joining.records import tracklets_in
+from optipmb.model.attributes import WORDS, leading
 from optipmb.model.class_names import common_name
 
 if TYPE_CHECKING:
+    from optipmb.model.attributes import Attributes
     from optipmb.model.lost_objects import Statistics, Tracklets
     from optipmb.model.rows import Array, Index
 
@@ -64,6 +66,10 @@ RETURNS: Final = 0.5
 SHORTEST_S: Final = 0.2
 """T_0."""
 REACH_M: Final = 3.0
+ALIKE: Final = (3.0, 6.0)
+"""Term of an equal attribute, and of all of them at most."""
+KNOWN: Final = (0.5, 2.0 / 3.0)
+"""Least evidence of an attribute that is known, and least share of it."""
 SIZE_NOISE: Final = 0.06
 """Standard deviation of the logarithm of a track's mean size."""
 SIZE_BOUNDS: Final = (-6.0, 2.5)
@@ -215,6 +221,39 @@ def size_score(i: Array, j: Array, count: Array, mean: Array, square: Array, lea
         a, b = i[axis] - mean[axis], j[axis] - mean[axis]
         total += -0.5 * ((b - share * a) ** 2 / rest - b**2) / variance - 0.5 * math.log(rest)
     return min(max(total, SIZE_BOUNDS[0]), SIZE_BOUNDS[1])
+
+
+class KnownTexts(NamedTuple):
+    """Attributes of objects that are known, ascending ids."""
+
+    id: Index  # (R,)
+    name: Index  # (R, W) bytes
+    text: Index  # (R, W)
+
+    @classmethod
+    def of(cls, attributes: Attributes | None) -> KnownTexts:
+        """Return those that have evidence enough."""
+        if attributes is None:
+            return NO_TEXTS
+        rows, share = leading(attributes)
+        rows = rows[(attributes.evidence[rows] >= KNOWN[0]) & (share >= KNOWN[1])]
+        return cls(attributes.id[rows], attributes.name[rows], attributes.text[rows])
+
+
+NO_TEXTS: Final = KnownTexts(np.zeros(0, np.int64), *np.zeros((2, 0, WORDS), np.int64))
+
+
+@kernel
+def attribute_score(known: KnownTexts, i: int, j: int) -> float:
+    """Return the log ratio of two ids by known attributes: -inf where one differs, bounded where they are equal."""
+    total, ids = 0.0, known.id
+    for a in range(np.searchsorted(ids, i), np.searchsorted(ids, i, "right")):
+        for b in range(np.searchsorted(ids, j), np.searchsorted(ids, j, "right")):
+            if (known.name[a] == known.name[b]).all():
+                if not (known.text[a] == known.text[b]).all():
+                    return -math.inf
+                total += ALIKE[0]
+    return min(total, ALIKE[1])
 
 
 @kernel

@@ -191,6 +191,7 @@ def follow(
         if row[k] < 0:
             rows.id[k], rows.object[k], rows.first_ns[k], rows.probability[k] = tracks.id[n], -1, stamp_ns, 1.0
             rows.begin[k], rows.size[k] = tracks.center[n, :2], math.nan
+            rows.candidate[k], rows.candidate_probability[k] = -1, math.nan
         if n >= 0 and tracks.detection[n] >= 0:
             hits[hit], hit = k, hit + 1
         elif row[k] >= 0 and live.last_ns[row[k]] == before_ns:

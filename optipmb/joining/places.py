@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.joining.evidence import RETURNS
-from optipmb.joining.records import beginnings_in, copy_rows, layout_of, returns_in
+from optipmb.joining.evidence import RETURNS, log_sum
+from optipmb.joining.records import beginnings_in, copy_rows, layout_of, returns_in, tracklets_in
 from optipmb.model.lost_objects import Beginnings, Returns
 from optipmb.model.polygons import inside
 
@@ -169,6 +169,26 @@ def passage_score(i: Tracklets, n: int, j: Tracklets, k: int, declared: Declared
             density = (1.0 - BY_PACE) * density + BY_PACE * _log_normal(t, way / speed, deviation)
         total += RETURNS_BY_PASSAGE * density / declared.area[q]
     return math.log(total) if total > 0.0 else -math.inf
+
+
+@kernel
+def with_declared(score: Array, words: Array, before: Index, after: Index, declared: DeclaredPlaces) -> Array:
+    """Return scores (P,) of rows of `Tracklets` with passages; -inf where one is lost, or the other begins, in an exit.
+
+    Args:
+        score: `optipmb.joining.evidence.pair_scores`.
+        words: of the tracks.
+        before: (P,) rows before the gap.
+        after: (P,) rows behind it.
+        declared: the exits and passages.
+    """
+    rows, result = tracklets_in(words), score.copy()
+    for p in range(score.shape[0]):
+        if in_exit(declared, rows.end[before[p]]) or in_exit(declared, rows.begin[after[p]]):
+            result[p] = -math.inf
+        elif score[p] > -math.inf:
+            result[p] = log_sum(score[p], passage_score(rows, before[p], rows, after[p], declared))
+    return result
 
 
 @kernel

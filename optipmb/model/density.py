@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 import numpy as np
 
 from optipmb.compiled import kernel
+from optipmb.model.attributes import Attributes
 from optipmb.model.errors import DensityError
 from optipmb.model.lost_objects import (
     EMBEDDING,
@@ -248,6 +249,7 @@ class Density:
             evidence that it moves so, and the time over which that was found, s (`optipmb.learning.sensor_motion`);
             None where it stands or frames have poses.
         rejoining: lost objects and what else joining needs; None where tracks are not joined.
+        attributes: texts of the objects, also of lost ones; None where no detection has brought any.
     """
 
     stamp_ns: int
@@ -260,6 +262,7 @@ class Density:
     self_calibration: SelfCalibration | None = None
     sensor: Array | None = None
     rejoining: Rejoining | None = None
+    attributes: Attributes | None = None
 
     @property
     def sensor_motion(self) -> Array | None:
@@ -371,7 +374,8 @@ def columns_of(density: Density) -> dict[str, NDArray[Any]]:
 def _records(density: Density) -> list[Rows]:
     own = density.rejoining
     joining = () if own is None else (own.live, own.places, own.lost, own.beginnings, own.returns, own.classes)
-    return [rows for rows in (density.bernoulli, density.poisson, density.misses, *joining) if rows is not None]
+    records = density.bernoulli, density.poisson, density.misses, *joining, density.attributes
+    return [rows for rows in records if rows is not None]
 
 
 def _others(density: Density) -> dict[str, NDArray[Any]]:
@@ -421,7 +425,7 @@ def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[An
         DensityError: a part is missing, is not whole rows, or has a flag that is neither 0 nor 1.
     """
     columns: dict[str, NDArray[Any]] = {}
-    kinds: tuple[type[Rows], ...] = (Bernoullis, Poissons, Misses, *JOINING)
+    kinds: tuple[type[Rows], ...] = (Bernoullis, Poissons, Misses, *JOINING, Attributes)
     for kind in kinds:
         if kind in {Bernoullis, Poissons} or kind.part in parts:
             rows = kind.of(_words(parts, kind.part, kind.width))
@@ -519,7 +523,21 @@ def density_of(stamp_ns: int, next_id: int, columns: Mapping[str, Any], labels: 
             raise DensityError(SENSOR, f"(5,) finite numbers up to {MOST_COUNTED:g}", shown(motion))
         motion = np.array(motion, np.float64)
     joining = _rejoining(columns, stamp_ns, next_id, len(labels)) if f"{Tracklets.part}.id" in columns else None
-    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses, pi, own, motion, joining)
+    texts = _attributes(columns, next_id) if f"{Attributes.part}.id" in columns else None
+    return Density(stamp_ns, next_id, bernoulli, poisson, tuple(labels), misses, pi, own, motion, joining, texts)
+
+
+def _attributes(columns: Mapping[str, Any], next_id: int) -> Attributes:
+    """Return the attributes of objects, in the order of their ids."""
+    rows = _rows(Attributes, columns)
+    for name, column, low, high in (
+        ("id", np.diff(rows.id, prepend=0), 0, next_id),
+        ("id", rows.id, 1, next_id - 1),
+        ("evidence", rows.evidence, 0.0, MOST_COUNTED),
+    ):
+        if column.size and not low <= column.min() <= column.max() <= high:
+            raise DensityError(f"{rows.part}.{name}", f"from {low} to {high}", f"{column.min()} to {column.max()}")
+    return rows
 
 
 def _rejoining(columns: Mapping[str, Any], stamp_ns: int, next_id: int, classes: int) -> Rejoining:
@@ -533,6 +551,7 @@ def _rejoining(columns: Mapping[str, Any], stamp_ns: int, next_id: int, classes:
             ("label", rows.label, 0, classes - 1),
             ("object", rows.object - rows.id, -next_id, 0),
             ("object", rows.object, -1 if rows is found.live else 0, next_id - 1),
+            ("candidate", rows.candidate, -1, next_id - 1),
             ("first_ns", rows.first_ns, 0, stamp_ns),
             ("last_ns", rows.last_ns - rows.first_ns, 0, stamp_ns),
             ("last_ns", rows.last_ns, 0, stamp_ns),

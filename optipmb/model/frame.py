@@ -29,16 +29,18 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, Self
 import numpy as np
 
 from optipmb.compiled import kernel
+from optipmb.model.attributes import readings_of
 from optipmb.model.class_names import class_indices
 from optipmb.model.errors import FrameError
 from optipmb.model.lost_objects import EMBEDDING
 from optipmb.model.rows import read_only
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
+    from optipmb.model.attributes import Readings
     from optipmb.model.parameters import Parameters, ScoreCalibration
     from optipmb.model.rows import Array, Index
 
@@ -300,6 +302,7 @@ class Frame:
         position_covariance: (M, 3) R_xx, R_xy and R_yy of each position, m^2; NaN, or None: R of the class.
         pose: world from sensor; None: the sensor stands at the origin of the world.
         embedding: appearance of the detections; None: unknown.
+        readings: attributes of the detections; None: unknown.
 
     The arrays cannot be written to, so that they stay as they were checked.
 
@@ -321,6 +324,7 @@ class Frame:
     position_covariance: Array | None = None
     pose: Pose | None = None
     embedding: Embedding | None = None
+    readings: Readings | None = None
 
     def __post_init__(self) -> None:
         count = np.shape(self.score)[0] if np.ndim(self.score) == 1 else 0
@@ -372,6 +376,7 @@ def make_frame(
     position_covariance: ArrayLike | None = None,
     embedding: ArrayLike | None = None,
     embedding_model: str | None = None,
+    attributes: Sequence[Mapping[str, Any] | None] | None = None,
 ) -> tuple[Frame, int]:
     """Check the detections of one stamp and bring them to the world frame and to the classes of the parameters.
 
@@ -397,6 +402,8 @@ def make_frame(
             of the class; a matrix of NaN, or None, where the detector gives none.
         embedding: (M, E) appearance of each detection, E from 2 to 512, of any length; a row of NaN where unknown.
         embedding_model: model and version of these vectors; required with them.
+        attributes: up to 8 texts by name of each detection, as `{"plate": "AB 12"}` or with a score in (0, 1]
+            `{"plate": ("AB 12", 0.8)}`, names and texts of up to 32 bytes; None where unknown.
 
     Returns:
         The frame, and how many objects were left out: their class is not in the parameters, or their score is 0.
@@ -422,7 +429,9 @@ def make_frame(
     columns = which, center, size, yaw, score, velocity
     looks = None if embedding is None else embedding_of(embedding_model, embedding, m)
     named = tuple(labels)
-    return frame_of_checked(parameters, int(stamp_ns), named, columns, pose, cloud, field_of_view, spread, looks)
+    texts = None if attributes is None else readings_of(attributes, m)
+    rest = pose, cloud, field_of_view, spread, looks, texts
+    return frame_of_checked(parameters, int(stamp_ns), named, columns, *rest)
 
 
 def frame_of_checked(
@@ -435,6 +444,7 @@ def frame_of_checked(
     field_of_view: FieldOfView | None,
     position_covariance: Array | None,
     embedding: Embedding | None = None,
+    readings: Readings | None = None,
 ) -> tuple[Frame, int]:
     """Make a frame as `make_frame` does, of arrays that the caller has checked: only covariances are checked here.
 
@@ -474,7 +484,7 @@ def frame_of_checked(
     if field_of_view is not None and field_of_view.pose is None and pose is not None:
         field_of_view = field_of_view.at(pose)
     sensor = pose if pose is not None or field_of_view is None else field_of_view.pose
-    rest = names, cloud, field_of_view, spread, sensor, embedding
+    rest = names, cloud, field_of_view, spread, sensor, embedding, readings
     for column in columns if spread is None else (*columns, spread):
         column.flags.writeable = False
     if rotation is not None and not allowed(known, len(names), center, size, yaw, score, velocity):

@@ -44,6 +44,8 @@ class Tracklets(Rows):
         end_variance: (N,).
         yaw: (N,) last heading, rad.
         size: (N, 3) mean logarithms of length, width and height.
+        candidate: (N,) int64 earlier object that fitted best when the track was decided; -1: none did.
+        candidate_probability: (N,) that it continues an earlier object, at the decision; NaN where none fitted.
     """
 
     part = "rejoin.tracks"
@@ -65,6 +67,8 @@ class Tracklets(Rows):
     end_variance = Column(np.float64)
     yaw = Column(np.float64)
     size = Column(np.float64, 3)
+    candidate = Column(np.int64)
+    candidate_probability = Column(np.float64)
 
 
 class Lost(Tracklets):

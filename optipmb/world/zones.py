@@ -41,7 +41,7 @@ How = Literal["crossed", "appeared", "lost", "ended", ""]
 
 MOST: Final = 256
 """Zones and lines of a session."""
-COUNTS: Final = ("inside", "entered", "left", "appeared", "lost", "to_left", "to_right")
+COUNTS: Final = ("inside", "entered", "left", "appeared", "lost", "to_left", "to_right", "distinct")
 _SECOND: Final = 1_000_000_000
 _OUTSIDE, _NEAR, _INSIDE = 0, 1, 2
 
@@ -136,6 +136,8 @@ class Seen(NamedTuple):
     """lines that it is near: where it was before it came near"""
     confirmed: bool = False
     held: tuple[Event, ...] = ()
+    entered: tuple[str, ...] = ()
+    """zones that its object is counted in"""
 
 
 @dataclass(frozen=True)
@@ -250,6 +252,7 @@ def observe(
     labels: Sequence[str],
     shapes: Shapes | None = None,
     objects: Index | None = None,
+    gap_s: float = 0.0,
 ) -> tuple[ZoneState, tuple[Event, ...]]:
     """Return the state after a frame, and its events ordered by time, zone and id.
 
@@ -262,6 +265,7 @@ def observe(
         shapes: the zones as arrays, where they are at hand.
         objects: (N,) id of the first track of the object of each track, -1 while that is not decided; None: tracks are
             not joined.
+        gap_s: time after which an object may still be joined.
     """
     known, numbers = dict(state.tracks), dict(state.objects)
     if objects is not None:
@@ -294,6 +298,11 @@ def observe(
         if seen_now is not None and not seen_now.confirmed:
             events += seen_now.held
             known[identities[row]] = seen_now._replace(confirmed=True, held=())
+    first = []
+    for one in events:
+        if one.kind == "entered" and one.zone not in (seen_now := known[one.id]).entered:
+            known[one.id] = seen_now._replace(entered=(*seen_now.entered, one.zone))
+            first.append((one.zone, one.id, one.at_ns))
     times = [_ns(one.lost_s) for one in zones if one.polygon] or [_ns(Zone.lost_s)]
     soonest_ns, longest_ns = min(times), max(times)
     here = set(identities)
@@ -304,11 +313,11 @@ def observe(
         seen, more = _lost(zones, identity, known[identity], silent_ns, "lost")
         events += more
         known[identity] = seen
-        if silent_ns > longest_ns and identity not in here:
+        if silent_ns > max(longest_ns, _ns(gap_s)) and identity not in here:
             del known[identity]
     events = [one._replace(object=numbers.get(one.id)) for one in events] if numbers else events
     kept = {identity: number for identity, number in numbers.items() if identity in known}
-    return _counted(replace(state, tracks=known, objects=kept), events)
+    return _counted(replace(state, tracks=known, objects=kept), events, first)
 
 
 def _rejoined(
@@ -324,6 +333,7 @@ def _rejoined(
         objects: of the tracks of the frame.
     """
     before = {number: identity for identity, number in numbers.items()}
+    lasts_ns = max(_ns(one.lost_s) for one in zones)
     for identity, number in objects.items():
         if number < 0 or identity in numbers:
             continue
@@ -333,6 +343,9 @@ def _rejoined(
             continue
         del numbers[last]
         silent_ns = stamp_ns - seen.stamp_ns
+        if silent_ns > lasts_ns and identity in known:
+            known[identity] = known[identity]._replace(entered=seen.entered)
+            continue
         far = {one.name: (-1, seen.place) for one in zones if one.line and silent_ns > _ns(one.lost_s)}
         known[identity] = seen._replace(near={**seen.near, **far})
 
@@ -350,6 +363,7 @@ def adapted(zones: Sequence[Zone], state: ZoneState) -> ZoneState:
             visits={name: one for name, one in seen.visits.items() if name in kept},
             near={name: one for name, one in seen.near.items() if name in kept},
             held=tuple(one for one in seen.held if one.zone in kept),
+            entered=tuple(name for name in seen.entered if name in kept),
         )
         for identity, seen in state.tracks.items()
     }
@@ -469,8 +483,16 @@ def _left(zone: Zone, visit: Visit, now: Event, how: How) -> list[Event]:
     return [event._replace(at_ns=visit.last_ns, position=visit.place, dwell_s=dwell_s)]
 
 
-def _counted(state: ZoneState, events: Iterable[Event]) -> tuple[ZoneState, tuple[Event, ...]]:
-    """Return the state with events counted, and these with their numbers."""
+def _counted(
+    state: ZoneState, events: Iterable[Event], first: Sequence[tuple[str, int, int]] = ()
+) -> tuple[ZoneState, tuple[Event, ...]]:
+    """Return the state with events counted, and these with their numbers.
+
+    Args:
+        state: of the zones.
+        events: of the frame.
+        first: zone, id and time of those by which objects enter a zone that they have not been in.
+    """
     ordered = sorted(events, key=lambda one: (one.at_ns, one.zone, one.id, one.kind))
     if not ordered:
         return state, ()
@@ -481,7 +503,12 @@ def _counted(state: ZoneState, events: Iterable[Event]) -> tuple[ZoneState, tupl
         numbers[key] = numbers.get(key, 0) + 1
         ordered[place] = one._replace(n=numbers[key])
         steps = {
-            "entered": {"inside": 1, "entered": 1, "appeared": one.how == "appeared"},
+            "entered": {
+                "inside": 1,
+                "entered": 1,
+                "distinct": (one.zone, one.id, one.at_ns) in first,
+                "appeared": one.how == "appeared",
+            },
             "left": {"inside": -1, "left": 1, "lost": one.how == "lost"},
             "crossed": {f"to_{one.direction}": 1},
             "stayed": {},

@@ -25,6 +25,7 @@ from optipmb_schemas.keys import PREFIX, Keys, Query, Topic
 from optipmb_schemas.limits import DEFAULT, Limits
 from optipmb_schemas.messages import (
     PATHS,
+    Attribute,
     Delivery,
     Density,
     Detections,
@@ -51,6 +52,7 @@ __all__ = [
     "PREFIX",
     "STORED",
     "Array",
+    "Attribute",
     "Code",
     "Delivery",
     "Density",

@@ -478,7 +478,9 @@ def encode_columns(
     parts: list[Any] = [_head(len(header) + len(names) + len(others)), _without_head(header)]
     heads, places, end = _column_heads(kind, names, columns.size, (len(parts[0]) + len(parts[1])) % ALIGNMENT)
     parts += chain.from_iterable(zip(heads, map(columns.data.cast("B").__getitem__, places), strict=True))
-    fields = {name: _plain(one, blocks=True) if isinstance(one, Message) else one for name, one in others.items()}
+    fields = {
+        name: _plain(one, blocks=True) if isinstance(one, Message | tuple) else one for name, one in others.items()
+    }
     return b"".join(parts + _field_parts(kind, fields, end))
 
 

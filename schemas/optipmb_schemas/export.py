@@ -25,6 +25,7 @@ from optipmb_schemas.control import MemberSummary, SessionState, SessionSummary
 from optipmb_schemas.errors import CODES
 from optipmb_schemas.limits import DEFAULT
 from optipmb_schemas.messages import (
+    Attribute,
     Delivery,
     Detections,
     FieldOfView,
@@ -46,6 +47,7 @@ _KINDS: Final[tuple[type[Message], ...]] = (
     Pose,
     Relocation,
     FieldOfView,
+    Attribute,
     Delivery,
     ZoneEvent,
     ZoneCount,

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from optipmb_schemas.messages import Events, Tracks
+    from optipmb_schemas.messages import Attribute, Events, Tracks
 
     Place = Callable[[Any, Any], tuple[NDArray[np.float64], ...]]
     """Returns latitudes, longitudes, heights and headings of centres (N, 3) and yaws (N,)."""
@@ -52,6 +52,12 @@ Size = Annotated[tuple[Known, Known, Known], Meta(description="Length, width, he
 Class = Annotated[str, Meta(description="Name of the class.")]
 
 
+Told = Annotated[
+    dict[str, tuple[str, float]],
+    Meta(description="What is known of the object, as its plate: by name a text and its share of the evidence."),
+]
+
+
 class EdgeTrack(Struct, frozen=True, rename={"kind": "class"}):
     """One track. Fields that a reader did not ask for are absent."""
 
@@ -77,6 +83,7 @@ class EdgeTrack(Struct, frozen=True, rename={"kind": "class"}):
         Annotated[str, Meta(description="32 hexadecimal digits: one in all streams. Absent: it is not linked.")]
         | UnsetType
     ) = UNSET
+    attributes: Told | UnsetType = UNSET
     lat: Lat | UnsetType = UNSET
     lon: Lon | UnsetType = UNSET
     alt: Alt | UnsetType = UNSET
@@ -135,6 +142,7 @@ class EdgeEvent(_FrameForm, frozen=True, tag="event", kw_only=True, rename={"nam
     lon: Lon | UnsetType = UNSET
     alt: Alt | UnsetType = UNSET
     object: Annotated[int, Meta(description="Id of the first track of its object.")] | UnsetType = UNSET
+    attributes: Told | UnsetType = UNSET
     event_id: Annotated[str, Meta(description="Where a reader goes on: `after`. Absent over MQTT.")] | UnsetType = UNSET
 
 
@@ -143,7 +151,7 @@ class EdgeZones(_FrameForm, frozen=True, tag="zones", kw_only=True):
 
     zones: Annotated[
         dict[str, dict[str, dict[str, int]]],
-        Meta(description="By zone and class: `inside`, `entered`, `left`, `appeared`, `lost`, `to_left`, `to_right`."),
+        Meta(description="By zone and class: `inside`, `entered`, `distinct` objects, `left`, …, as in Events."),
     ]
 
 
@@ -186,6 +194,13 @@ class EdgeObject(Struct, frozen=True, rename={"name": "class"}):
         None
     )
     embedding: Annotated[list[float], Meta(description="Appearance, of the frame's `embedding_model`.")] | None = None
+    attributes: (
+        Annotated[
+            dict[str, str | tuple[str, float]],
+            Meta(description="Texts by name, as `plate`, each alone or with a score; at most 8 of 32 bytes."),
+        ]
+        | None
+    ) = None
 
 
 class EdgeDetections(Struct, frozen=True, forbid_unknown_fields=True):
@@ -270,6 +285,14 @@ def _objects(tracks: Tracks, rows: NDArray[np.int64]) -> dict[str, Iterable[Any]
     return {"object": [one for one, _ in told], "object_probability": [share for _, share in told]}
 
 
+def _told(attributes: tuple[Attribute, ...] | None) -> dict[int, dict[str, tuple[str, float]]]:
+    """Return the attributes of each row that has any."""
+    found: dict[int, dict[str, tuple[str, float]]] = {}
+    for one in attributes or ():
+        found.setdefault(one.row, {})[one.name] = one.text, round(one.score, DIGITS)
+    return found
+
+
 def tracks_json(
     tracks: Tracks, selection: Selection = EVERYTHING, place: Place | None = None, global_ids: Sequence[str] = ()
 ) -> bytes:
@@ -297,6 +320,7 @@ def tracks_json(
         **{name: np.round(column[rows], DIGITS).tolist() for name, column in numbers.items()},
         **_objects(tracks, rows),
         "global_id": (global_ids[row] or UNSET for row in rows.tolist()) if global_ids else repeat(UNSET),
+        "attributes": map(_told(tracks.attributes).get, rows.tolist(), repeat(UNSET)),
         **dict(zip(PLACE, _placed(tracks.center[rows], yaw[rows], place), strict=True)),
     }
     if selection.fields:
@@ -320,7 +344,7 @@ def features_json(frames: Iterable[bytes]) -> bytes:
                 continue
             coordinates = [one.pop(name) for name in ("lon", "lat", "alt")]
             point = {"type": "Point", "coordinates": coordinates}
-            name = f"{about['stream']}/{one['id']}"
+            name = f"{about['stream']}/{one.get('object', one['id'])}"  # as the UUID of ROS 2
             features.append({"type": "Feature", "id": name, "geometry": point, "properties": about | one})
     return msgspec.json.encode({"type": "FeatureCollection", "features": features})
 
@@ -329,7 +353,7 @@ def event_json(events: Events, place: Place | None = None) -> list[bytes]:
     """Return each event of a message as a text."""
     about = _about(events)
     position = np.array([one.position for one in events.events], np.float64).reshape(-1, 3)
-    placed = _placed(position, np.zeros(len(position)), place)
+    placed, told = _placed(position, np.zeros(len(position)), place), _told(events.attributes)
     rows = zip(events.events, *placed, strict=True)
     return [
         msgspec.json.encode(
@@ -349,12 +373,13 @@ def event_json(events: Events, place: Place | None = None) -> list[bytes]:
                 dwell_s=UNSET if one.dwell_s is None else round(one.dwell_s, DIGITS),
                 direction=one.direction or UNSET,
                 object=UNSET if one.object is None else one.object,
+                attributes=told.get(row, UNSET),
                 lat=lat,
                 lon=lon,
                 alt=alt,
             )
         )
-        for one, lat, lon, alt, _ in rows
+        for row, (one, lat, lon, alt, _) in enumerate(rows)
     ]
 
 

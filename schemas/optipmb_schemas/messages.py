@@ -49,6 +49,10 @@ ROUNDING = 8 * sys.float_info.epsilon
 """Share of the sum of variances by which one of them may be beyond its limit: errors of computation are smaller."""
 EMBEDDING: Final = (2, 512)
 """Least and most numbers of a vector of appearance."""
+BRIEF: Final = 32
+"""Longest name or text of an attribute, bytes."""
+MOST_ATTRIBUTES: Final = 8
+"""Attributes of an object."""
 SHORTEST = 1e-6
 """Least length of one."""
 SYMMETRY = 1e-6
@@ -144,6 +148,26 @@ RADIANS: Final = ", radians (in JSON, `heading` takes degrees clockwise from nor
 """Added to the range of headings."""
 
 
+Brief = Annotated[str, Field(strict=True, min_length=1, max_length=32)]
+
+
+class Attribute(Message):
+    """A text that says something of an object, as its plate or its colour."""
+
+    row: Count = Field(description="Row of the object in the arrays; of `Events`: of the event.")
+    name: Brief = Field(description="What the text says, as `plate`: at most 32 bytes.")
+    text: Brief = Field(description="The text, at most 32 bytes.")
+    score: Annotated[float, Field(strict=True, gt=0, le=1)] = Field(
+        default=1.0, description="Confidence of a detection in it; of a track its share of the evidence for `name`."
+    )
+
+    def check(self) -> None:
+        """Names and texts are short, also where their characters take several bytes."""
+        for name in ("name", "text"):
+            if len(getattr(self, name).encode()) > BRIEF or "\0" in getattr(self, name):
+                raise invalid(name, f"a text of at most {BRIEF} bytes", getattr(self, name))
+
+
 class Detections(SensorMessage):
     """The detected objects of one frame, M of them (M may be 0). One row of every array is one object."""
 
@@ -202,10 +226,16 @@ class Detections(SensorMessage):
         description="Model and version that `embedding` is of, as `reid-7`; required with it. Only vectors of one "
         "model are compared.",
     )
+    attributes: tuple[Attribute, ...] | None = Field(
+        default=None,
+        max_length=100_000,
+        description="Texts that are known of the objects: at most 8 of each, with different names.",
+    )
 
     def check(self) -> None:
         """Every label must be in the list, every covariance and every vector must be one."""
         super().check()
+        _check_attributes(self.attributes or (), len(self.label))
         _check_labels(self.label, self.labels)
         if self.position_covariance is not None:
             _check_covariances(self.position_covariance)
@@ -338,6 +368,12 @@ class Tracks(ResultMessage):
     object_probability: Annotated[Singles, Array("f4", ("N",), 0, 1)] | None = Field(
         default=None, description="That all joins of the object are right: their product. 1 without a join."
     )
+    attributes: tuple[Attribute, ...] | None = Field(
+        default=None,
+        max_length=100_000,
+        description="Of each attribute of an object the text with most evidence, over all its detections and gaps. "
+        "Absent: no detection has brought any.",
+    )
     horizons: Horizons | None = Field(
         default=None,
         description="Times of the predicted paths after `stamp_ns`, s, ascending. Absent, as are the next three: the "
@@ -361,6 +397,7 @@ class Tracks(ResultMessage):
         """Labels must be in the list, ids ascending, the fields of paths there together, C classes in `labels`."""
         super().check()
         _check_labels(self.label, self.labels)
+        _check_attributes(self.attributes or (), len(self.id))
         probability, classes = self.class_probability, len(self.labels)
         if probability is not None and probability.shape[1] != classes:
             if len(probability):
@@ -456,6 +493,9 @@ class ZoneCount(Message):
     lost: Counts = Field(description="Of those that left, were no longer detected.")
     to_left: Counts = Field(description="Crossings of the line to its left.")
     to_right: Counts = Field(description="Crossings of the line to its right.")
+    distinct: Counts | None = Field(
+        default=None, description="Objects that have entered; one that left, also one joined over a gap, counts once."
+    )
 
 
 class Events(ResultMessage):
@@ -464,6 +504,9 @@ class Events(ResultMessage):
     labels: Labels = Field(description="Names of the classes that `label` counts.")
     events: tuple[ZoneEvent, ...] = Field(
         default=(), max_length=100_000, fail_fast=True, description="In order of `at_ns`, `zone` and `id`."
+    )
+    attributes: tuple[Attribute, ...] | None = Field(
+        default=None, max_length=100_000, description="What is known of the objects of the events, as in `Tracks`."
     )
     zones: tuple[ZoneCount, ...] | None = Field(
         default=None,
@@ -480,6 +523,7 @@ class Events(ResultMessage):
         for at, event in enumerate(self.events):
             if event.label >= classes:
                 raise invalid(f"events[{at}].label", f"an index into the {classes} labels", event.label)
+        _check_attributes(self.attributes or (), len(self.events))
         for at, zone in enumerate(self.zones or ()):
             for name, value in zone.present():
                 if name != "zone" and len(value) != classes:
@@ -534,6 +578,19 @@ class Density(Message):
     z: Annotated[Reals, Array("f8", ("N",), -1e30, 1e30)] = Field(
         description="Height of the centre in metres, world frame."
     )
+    track: Annotated[Integers, Array("i8", ("T",), 0, INT64)] | None = Field(
+        default=None,
+        description="Ids of the T tracks on which joining has decided. Absent, as are the next two: tracks are not "
+        "joined.",
+    )
+    candidate: Annotated[Integers, Array("i8", ("T",), -1, INT64)] | None = Field(
+        default=None, description="Earlier object that fitted each of them best; -1: none did."
+    )
+    candidate_probability: Annotated[Singles, Array("f4", ("T",), 0, 1, unknown="number")] | None = Field(
+        default=None,
+        description="That the track continues an earlier object; NaN (JSON: null): none fitted. Below "
+        "`min_probability` of the settings it was not joined.",
+    )
 
     def check(self) -> None:
         """Labels must be in the list."""
@@ -545,6 +602,19 @@ def _check_labels(label: Integers, labels: tuple[str, ...]) -> None:
     values = label.tolist()
     if values and (most := max(values)) >= len(labels):
         raise invalid(f"label[{values.index(most)}]", f"an index into the {len(labels)} labels", most)
+
+
+def _check_attributes(attributes: tuple[Attribute, ...], rows: int) -> None:
+    known: dict[int, set[str]] = {}
+    for at, one in enumerate(attributes):
+        names = known.setdefault(one.row, set())
+        if one.row >= rows:
+            raise invalid(f"attributes[{at}].row", f"one of the {rows} rows", one.row)
+        if one.name in names:
+            raise invalid(f"attributes[{at}].name", "different names for each row", one.name)
+        names.add(one.name)
+        if len(names) > MOST_ATTRIBUTES:
+            raise invalid(f"attributes[{at}]", f"at most {MOST_ATTRIBUTES} of each row", len(names))
 
 
 def _check_covariances(covariance: Reals) -> None:

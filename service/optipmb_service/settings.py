@@ -424,8 +424,9 @@ class ZoneSettings(BaseModel):
     other"""
     min_s: float = Field(default=0.5, ge=0, le=86_400)
     """shorter visits give no events"""
-    lost_s: float = Field(default=2.0, ge=0, le=86_400)
-    """an object that was not detected for longer has left"""
+    lost_s: float | None = Field(default=None, ge=0, le=86_400)
+    """an object that was not detected for longer has left; default: 2, and where tracks are joined as long as that may
+    be"""
     dwell_s: tuple[Annotated[float, Field(gt=0, le=1e8)], ...] = ()
     """times inside after which there is an event"""
 

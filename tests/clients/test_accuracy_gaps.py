@@ -8,6 +8,7 @@ import pytest
 from optipmb_tools.run.rejoining import RejoinOptions, joins, tracklets
 
 from optipmb import generic_parameters
+from optipmb.joining.decision import Kinds
 
 SEEDS = range(21, 27)
 """Scenes that nothing was chosen by."""
@@ -21,7 +22,7 @@ def judged() -> gaps.Judged:
             recording = gaps.record(name, seed)
             tracks = gaps.tracked(recording.frames, parameters)
             rows = tracklets(tracks, parameters.labels)
-            joined = joins(rows, parameters, RejoinOptions.gap_s)
+            joined = joins(rows, Kinds.of(parameters), RejoinOptions.gap_s)
             found += gaps.judge(rows, joined, gaps.owners(tracks, recording.source))
     return found
 

@@ -21,6 +21,7 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 
 from optipmb import Parameters, generic_parameters
 from optipmb.joining import evidence
+from optipmb.joining.decision import Kinds
 from optipmb.model.lost_objects import Tracklets
 
 Array = NDArray[np.float64]
@@ -182,7 +183,7 @@ def test_an_object_is_one_track_in_a_frame(tracks: dict[int, Tracks]) -> None:
 
 def pairs_of(tracks: dict[int, Tracks], parameters: Parameters = GENERIC) -> dict[tuple[int, int], float]:
     found = tracklets(tracks, parameters.labels)
-    before, after, probability = joins(found, parameters, 60.0)
+    before, after, probability = joins(found, Kinds.of(parameters), 60.0)
     return dict(
         zip(zip(found.id[before].tolist(), found.id[after].tolist(), strict=True), probability.tolist(), strict=True)
     )

@@ -97,6 +97,7 @@ def test_a_table_with_other_names(folder: Path, capsys: pytest.CaptureFixture[st
         ("gaps.md", "The same object after a gap"),
         ("gaps.md", "While tracking"),
         ("gaps.md", "Appearance"),
+        ("gaps.md", "Attributes"),
         ("own-data.md", "Your own data: CSV, Parquet, JSON Lines"),
         ("own-data.md", "Latitude and longitude"),
         ("own-data.md", "Evaluate, tune, plot, replay"),

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from optipmb_schemas import (
+    Attribute,
     Delivery,
     Density,
     Detections,
@@ -36,6 +37,9 @@ POSE = Pose(translation=np.array([10.0, 20.0, 1.5]), quaternion=np.array([0.6, 0
 MOTION = Relocation(world=3, translation=np.array([10.0, -2.0, 0.5]), quaternion=np.array([0.8, 0.0, 0.0, -0.6]))
 VIEW = FieldOfView(azimuth=np.array([2.5, -2.5]), elevation=np.array([-0.4, 0.2]), range=np.array([0.5, 80]))
 HEADER = {"stream": "site-1/node.2/lidar_3", "epoch": EPOCH, "seq": 7, "stamp_ns": 1_700_000_000_123_456_789}
+
+
+PLATE = Attribute(row=1, name="plate", text="AB 12", score=0.75)
 
 
 def _examples() -> list[Message]:
@@ -103,7 +107,7 @@ def _examples() -> list[Message]:
     }
     left = ZoneEvent(zone="crossing", kind="left", how="lost", dwell_s=2.5, **where)
     crossed = ZoneEvent(zone="gate", kind="crossed", direction="left", **where)
-    names = ("inside", "entered", "left", "appeared", "lost", "to_left", "to_right")
+    names = ("inside", "entered", "left", "appeared", "lost", "to_left", "to_right", "distinct")
     linked = LinkedObject(
         global_id=bytes(range(16)),
         stream=HEADER["stream"],
@@ -120,6 +124,7 @@ def _examples() -> list[Message]:
         revision=1,
         labels=("car", "pedestrian"),
         events=(left, crossed),
+        attributes=(PLATE,),
         zones=(ZoneCount(zone="crossing", **dict.fromkeys(names, (0, 3))),),
         delivery=tracks.delivery,
     )
@@ -219,6 +224,7 @@ def example_of(examples: dict[str, Message]) -> Callable[[type[Message]], Messag
         "ZoneEvent": events.events[0],
         "ZoneCount": events.zones[0],
         "LinkedObject": links.objects[0],
+        "Attribute": PLATE,
     }
     return lambda kind: {**examples, **held}[kind.__name__]
 

@@ -95,6 +95,10 @@ class TrackOptions:
     min_probability: Annotated[
         float | None, typer.Option(help="With --rejoin: least probability of a join; default 0.98.", show_default=False)
     ] = None
+    places: Annotated[
+        Path | None,
+        typer.Option(help="With --rejoin: settings (TOML) whose [rejoin.PATTERN] has exits and passages."),
+    ] = None
     ids: Annotated[
         str,
         typer.Option(metavar="track|object", help="With --rejoin, object: ids of objects, in any format."),
@@ -119,9 +123,10 @@ class TrackOptions:
         """
         if self.rejoin is None:
             return None
-        from optipmb_tools.run.rejoining import RejoinOptions  # noqa: PLC0415  only with this option
+        from optipmb_tools.run.rejoining import RejoinOptions, places_in  # noqa: PLC0415  only with this option
 
-        return RejoinOptions(self.rejoin, *() if self.min_probability is None else (self.min_probability,))
+        least = RejoinOptions.min_probability if self.min_probability is None else self.min_probability
+        return RejoinOptions(self.rejoin, least, *() if self.places is None else places_in(self.places))
 
     def _check_joining(self) -> None:
         out = self.out
@@ -131,6 +136,8 @@ class TrackOptions:
             raise UsageError(f"--rejoin: expected --ids object or a table as --out, such as tracks.csv, received {out}")
         if self.rejoin is None and self.min_probability is not None:
             raise UsageError(f"--min-probability {self.min_probability:g}: expected --rejoin")
+        if self.rejoin is None and self.places is not None:
+            raise UsageError(f"--places {self.places}: expected --rejoin")
 
     def check_out(self, data: Data) -> None:
         """Refuse a file where the results are several; a bag of tracks holds one topic of a bag."""

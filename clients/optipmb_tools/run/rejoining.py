@@ -4,8 +4,10 @@ Beginnings before and after a track count for the rate of new objects, with the 
 turns estimate. Objects in view when a recording starts have not begun then, and count nothing.
 """
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -18,7 +20,7 @@ from optipmb.joining.decision import Kinds
 from optipmb.joining.evidence import QUANTUM, motion_of, pair_scores, size_score
 from optipmb.joining.following import FIT_NS, LEAST_FIT_S
 from optipmb.joining.matching import match
-from optipmb.joining.places import KERNEL_M
+from optipmb.joining.places import KERNEL_M, Passage, Polygon, with_declared
 from optipmb.model.lost_objects import SETTLES_NS, Tracklets
 from optipmb_tools.geometry import Floats, Ints
 from optipmb_tools.results import stacked
@@ -37,18 +39,24 @@ class RejoinOptions:
 
     gap_s: float = 60.0  # longest gap
     min_probability: float = 0.98
+    exits: tuple[Polygon, ...] = ()
+    passages: tuple[Passage, ...] = ()
 
     def __post_init__(self) -> None:
         try:
-            Rejoin(self.gap_s, self.min_probability)
+            Rejoin(self.gap_s, self.min_probability, exits=self.exits, passages=self.passages)
         except ParameterError as error:
+            if error.path.startswith(("rejoin.exits", "rejoin.passages")):
+                path = error.path.removeprefix("rejoin.")
+                raise UsageError(f"--places: {path}: expected {error.expected}, received {error.received}") from error
             option = "--rejoin" if error.path.endswith("gap_s") else "--min-probability"
             raise UsageError(f"{option}: expected {error.expected}, received {error.received}") from error
 
     def objects(self, tracks: Mapping[int, Tracks], parameters: Parameters) -> Objects:
         """Return the object of each track of a recording, given the tracks by frame in a fixed world frame."""
         found = tracklets(tracks, parameters.labels)
-        before, after, probability = joins(found, parameters, self.gap_s)
+        kinds = Kinds.of(parameters, Rejoin(self.gap_s, exits=self.exits, passages=self.passages))
+        before, after, probability = joins(found, kinds, self.gap_s)
         sure = probability >= self.min_probability
         before, after, probability = before[sure], after[sure], probability[sure]
         identity, product = found.id.copy(), np.ones(len(found))
@@ -58,6 +66,26 @@ class RejoinOptions:
             identity[after[k]] = identity[before[k]]
             product[after[k]] = product[before[k]] * probability[k]
         return Objects(found.id, identity, product, until)
+
+
+def places_in(path: Path) -> tuple[tuple[Polygon, ...], tuple[Passage, ...]]:
+    """Return the exits and passages of a file of settings.
+
+    Raises:
+        UsageError: it cannot be read, or has not one table `[rejoin.PATTERN]`, or another content.
+    """
+    try:
+        tables = tomllib.loads(path.read_text(encoding="utf-8"))["rejoin"]
+        (own,) = tables.values()
+        ways = [Passage(_polygon(one["from"]), _polygon(one["to"]), tuple(one["s"])) for one in own.get("passages", ())]
+        return tuple(map(_polygon, own.get("exits", ()))), tuple(ways)
+    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+        expected = "a file of settings with one table [rejoin.PATTERN], whose exits and passages are polygons"
+        raise UsageError(f"--places {path}: expected {expected}, received {error!r:.120}") from error
+
+
+def _polygon(corners: Sequence[Sequence[float]]) -> Polygon:
+    return tuple((float(x), float(y)) for x, y in corners)
 
 
 def tracklets(tracks: Mapping[int, Tracks], labels: Sequence[str]) -> Tracklets:
@@ -108,9 +136,8 @@ def _slope(stamp_ns: Ints, place: Floats, noise: float) -> tuple[Floats, float]:
     return velocity, (2.0 * noise**2 + 0.5 * float((rest**2).sum())) / len(time) / spread
 
 
-def joins(found: Tracklets, parameters: Parameters, gap_s: float) -> tuple[Ints, Ints, Floats]:
+def joins(found: Tracklets, kinds: Kinds, gap_s: float) -> tuple[Ints, Ints, Floats]:
     """Return the best joins: rows of the earlier and of the later tracks, and their probabilities."""
-    kinds = Kinds.of(parameters)
     kind, area = kinds.kind[found.label], kinds.area[found.label]
     order = np.argsort(found.first_ns, kind="stable")
     parts = [_pairs(found, one, kinds, gap_s) for one in np.split(order, range(AT_ONCE, len(order), AT_ONCE))]
@@ -135,6 +162,7 @@ def _pairs(found: Tracklets, later: Ints, kinds: Kinds, gap_s: float) -> tuple[I
     after = np.repeat(later, count)
     before = order[np.arange(len(after)) - np.repeat(np.cumsum(count) - high, count)]
     score = pair_scores(found.words, before, after, kinds.kind, kinds.motion, gap_s)
+    score = with_declared(score, found.words, before, after, kinds.declared)
     near = score > -np.inf
     return before[near], after[near], score[near]
 

@@ -44,7 +44,7 @@ from optipmb_client.errors import UsageError
 from optipmb_schemas import Detections, Message, Points, Problem, Tracks
 
 from optipmb_tools.geometry import rotation_of, shown_boxes, to_world
-from optipmb_tools.views.colours import rgb_of
+from optipmb_tools.views.colours import identities_of, rgb_of
 
 FRAME: Final = "world"
 ARROW_S: Final = 1.0  # an arrow is as long as the way of one second
@@ -85,7 +85,7 @@ class FoxgloveMessages:
     def of(self, message: Message) -> Iterator[Shown]:
         """Yield the messages that show one; none for other types."""
         if isinstance(message, Tracks):
-            shown = set(message.id.tolist())
+            shown = set(identities_of(message))
             gone = sorted(self._shown.get(message.stream, set()) - shown)
             self._shown[message.stream] = shown
             yield _made("/scene", _scene(message, gone))
@@ -109,7 +109,7 @@ def _scene(tracks: Tracks, gone: Iterable[int]) -> SceneUpdate:
     matching = SceneEntityDeletionType.MatchingId
     deletions = [SceneEntityDeletion(timestamp=stamp, type=matching, id=str(identity)) for identity in gone]
     entities = []
-    for row, identity in enumerate(tracks.id.tolist()):
+    for row, identity in enumerate(identities_of(tracks)):
         red, green, blue = (value / 255.0 for value in rgb_of(identity))
         solid = Color(r=red, g=green, b=blue, a=1.0)
         center, size = tracks.center[row].tolist(), tracks.size[row].tolist()

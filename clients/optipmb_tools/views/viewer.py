@@ -22,7 +22,7 @@ from optipmb_schemas import PREFIX, Density, Detections, Keys, Message, Points, 
 from optipmb_schemas.json_form import shown
 
 from optipmb_tools.geometry import Floats, rotation_of, shown_boxes
-from optipmb_tools.views.colours import rgb_of
+from optipmb_tools.views.colours import identities_of, rgb_of
 
 TRAIL_S: Final = 5.0
 SIGMAS: Final = 2.0
@@ -112,12 +112,13 @@ class View:
         if self._followed in {None, name}:
             middle = tracks.center[:, :2].mean(axis=0) if n else np.zeros(2)
             self._lay_out(name, self._places.get(name, middle))
-        colours = np.array([rgb_of(identity) for identity in tracks.id.tolist()], dtype=np.uint8).reshape(-1, 3)
+        identities = identities_of(tracks)
+        colours = np.array([rgb_of(identity) for identity in identities], dtype=np.uint8).reshape(-1, 3)
         sure = tracks.score >= SURE
         quaternions = _turned(tracks.yaw)
         labels = [
             f"{identity} {existence:.2f}" if certain else ""
-            for identity, existence, certain in zip(tracks.id, tracks.existence, sure, strict=True)
+            for identity, existence, certain in zip(identities, tracks.existence, sure, strict=True)
         ]
         log = self._recording.log
         log(
@@ -209,7 +210,7 @@ class View:
     def _trail(self, tracks: Tracks) -> tuple[list[Floats], list[int]]:
         """Return the ways (k, 3) of the last seconds and the ids that they belong to."""
         trails = self._trails.setdefault(tracks.stream, {})
-        for identity, center in zip(tracks.id.tolist(), tracks.center, strict=True):
+        for identity, center in zip(identities_of(tracks), tracks.center, strict=True):
             trails.setdefault(identity, collections.deque()).append((tracks.stamp_ns, center))
         for identity, trail in tuple(trails.items()):
             while trail and not 0 <= tracks.stamp_ns - trail[0][0] <= TRAIL_S * 1e9:

@@ -21,6 +21,7 @@ from optipmb_schemas.arrays import Array
 from optipmb_schemas.control import Problem, SessionParameters, SessionState, SessionSummary
 from optipmb_schemas.export import bring_up_to_date, read
 from optipmb_schemas.messages import (
+    Attribute,
     Delivery,
     Detections,
     Events,
@@ -41,6 +42,7 @@ MODELS: Final[tuple[type[Message], ...]] = (
     Pose,
     Relocation,
     FieldOfView,
+    Attribute,
     Detections,
     Points,
     Delivery,

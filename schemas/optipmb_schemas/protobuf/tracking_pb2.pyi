@@ -81,8 +81,20 @@ class FieldOfView(_message.Message):
     range: _containers.RepeatedScalarFieldContainer[float]
     def __init__(self, azimuth: _Optional[_Iterable[float]] = ..., elevation: _Optional[_Iterable[float]] = ..., range: _Optional[_Iterable[float]] = ...) -> None: ...
 
+class Attribute(_message.Message):
+    __slots__ = ("row", "name", "text", "score")
+    ROW_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    SCORE_FIELD_NUMBER: _ClassVar[int]
+    row: int
+    name: str
+    text: str
+    score: float
+    def __init__(self, row: _Optional[int] = ..., name: _Optional[str] = ..., text: _Optional[str] = ..., score: _Optional[float] = ...) -> None: ...
+
 class Detections(_message.Message):
-    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "frame", "pose", "relocation", "labels", "label", "center", "size", "yaw", "score", "velocity", "has_points", "field_of_view", "position_covariance", "embedding", "embedding_model")
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "frame", "pose", "relocation", "labels", "label", "center", "size", "yaw", "score", "velocity", "has_points", "field_of_view", "position_covariance", "embedding", "embedding_model", "attributes")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -102,6 +114,7 @@ class Detections(_message.Message):
     POSITION_COVARIANCE_FIELD_NUMBER: _ClassVar[int]
     EMBEDDING_FIELD_NUMBER: _ClassVar[int]
     EMBEDDING_MODEL_FIELD_NUMBER: _ClassVar[int]
+    ATTRIBUTES_FIELD_NUMBER: _ClassVar[int]
     stream: str
     epoch: bytes
     seq: int
@@ -121,7 +134,8 @@ class Detections(_message.Message):
     position_covariance: Array
     embedding: Array
     embedding_model: str
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame: _Optional[_Union[Frame, str]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., labels: _Optional[_Iterable[str]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., has_points: _Optional[bool] = ..., field_of_view: _Optional[_Union[FieldOfView, _Mapping]] = ..., position_covariance: _Optional[_Union[Array, _Mapping]] = ..., embedding: _Optional[_Union[Array, _Mapping]] = ..., embedding_model: _Optional[str] = ...) -> None: ...
+    attributes: _containers.RepeatedCompositeFieldContainer[Attribute]
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame: _Optional[_Union[Frame, str]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., labels: _Optional[_Iterable[str]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., has_points: _Optional[bool] = ..., field_of_view: _Optional[_Union[FieldOfView, _Mapping]] = ..., position_covariance: _Optional[_Union[Array, _Mapping]] = ..., embedding: _Optional[_Union[Array, _Mapping]] = ..., embedding_model: _Optional[str] = ..., attributes: _Optional[_Iterable[_Union[Attribute, _Mapping]]] = ...) -> None: ...
 
 class Points(_message.Message):
     __slots__ = ("stream", "epoch", "seq", "stamp_ns", "frame", "pose", "relocation", "xyz")
@@ -166,7 +180,7 @@ class Delivery(_message.Message):
     def __init__(self, instance: _Optional[str] = ..., received_ns: _Optional[int] = ..., published_ns: _Optional[int] = ..., queue_ms: _Optional[float] = ..., decode_ms: _Optional[float] = ..., step_ms: _Optional[float] = ..., run: _Optional[int] = ..., final_session: _Optional[str] = ..., final_ns: _Optional[int] = ...) -> None: ...
 
 class Tracks(_message.Message):
-    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "profile", "cloud_used", "gap", "ignored", "world", "labels", "predicted_to_ns", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "measured", "class_probability", "object", "object_probability", "horizons", "path_position", "path_yaw", "path_covariance", "relocation", "delivery")
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "profile", "cloud_used", "gap", "ignored", "world", "labels", "predicted_to_ns", "id", "label", "center", "size", "yaw", "heading_confidence", "velocity", "yaw_rate", "acceleration", "existence", "score", "covariance", "age", "time_since_detection", "detection", "confirmed", "measured", "class_probability", "object", "object_probability", "attributes", "horizons", "path_position", "path_yaw", "path_covariance", "relocation", "delivery")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -201,6 +215,7 @@ class Tracks(_message.Message):
     CLASS_PROBABILITY_FIELD_NUMBER: _ClassVar[int]
     OBJECT_FIELD_NUMBER: _ClassVar[int]
     OBJECT_PROBABILITY_FIELD_NUMBER: _ClassVar[int]
+    ATTRIBUTES_FIELD_NUMBER: _ClassVar[int]
     HORIZONS_FIELD_NUMBER: _ClassVar[int]
     PATH_POSITION_FIELD_NUMBER: _ClassVar[int]
     PATH_YAW_FIELD_NUMBER: _ClassVar[int]
@@ -241,13 +256,14 @@ class Tracks(_message.Message):
     class_probability: Array
     object: Array
     object_probability: Array
+    attributes: _containers.RepeatedCompositeFieldContainer[Attribute]
     horizons: Array
     path_position: Array
     path_yaw: Array
     path_covariance: Array
     relocation: Relocation
     delivery: Delivery
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., world: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., predicted_to_ns: _Optional[int] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., measured: _Optional[_Union[Array, _Mapping]] = ..., class_probability: _Optional[_Union[Array, _Mapping]] = ..., object: _Optional[_Union[Array, _Mapping]] = ..., object_probability: _Optional[_Union[Array, _Mapping]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., world: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., predicted_to_ns: _Optional[int] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., measured: _Optional[_Union[Array, _Mapping]] = ..., class_probability: _Optional[_Union[Array, _Mapping]] = ..., object: _Optional[_Union[Array, _Mapping]] = ..., object_probability: _Optional[_Union[Array, _Mapping]] = ..., attributes: _Optional[_Iterable[_Union[Attribute, _Mapping]]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
 
 class ZoneEvent(_message.Message):
     __slots__ = ("zone", "kind", "n", "id", "label", "at_ns", "position", "speed", "yaw", "how", "dwell_s", "direction", "object")
@@ -280,7 +296,7 @@ class ZoneEvent(_message.Message):
     def __init__(self, zone: _Optional[str] = ..., kind: _Optional[str] = ..., n: _Optional[int] = ..., id: _Optional[int] = ..., label: _Optional[int] = ..., at_ns: _Optional[int] = ..., position: _Optional[_Iterable[float]] = ..., speed: _Optional[float] = ..., yaw: _Optional[float] = ..., how: _Optional[str] = ..., dwell_s: _Optional[float] = ..., direction: _Optional[str] = ..., object: _Optional[int] = ...) -> None: ...
 
 class ZoneCount(_message.Message):
-    __slots__ = ("zone", "inside", "entered", "left", "appeared", "lost", "to_left", "to_right")
+    __slots__ = ("zone", "inside", "entered", "left", "appeared", "lost", "to_left", "to_right", "distinct")
     ZONE_FIELD_NUMBER: _ClassVar[int]
     INSIDE_FIELD_NUMBER: _ClassVar[int]
     ENTERED_FIELD_NUMBER: _ClassVar[int]
@@ -289,6 +305,7 @@ class ZoneCount(_message.Message):
     LOST_FIELD_NUMBER: _ClassVar[int]
     TO_LEFT_FIELD_NUMBER: _ClassVar[int]
     TO_RIGHT_FIELD_NUMBER: _ClassVar[int]
+    DISTINCT_FIELD_NUMBER: _ClassVar[int]
     zone: str
     inside: _containers.RepeatedScalarFieldContainer[int]
     entered: _containers.RepeatedScalarFieldContainer[int]
@@ -297,10 +314,11 @@ class ZoneCount(_message.Message):
     lost: _containers.RepeatedScalarFieldContainer[int]
     to_left: _containers.RepeatedScalarFieldContainer[int]
     to_right: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, zone: _Optional[str] = ..., inside: _Optional[_Iterable[int]] = ..., entered: _Optional[_Iterable[int]] = ..., left: _Optional[_Iterable[int]] = ..., appeared: _Optional[_Iterable[int]] = ..., lost: _Optional[_Iterable[int]] = ..., to_left: _Optional[_Iterable[int]] = ..., to_right: _Optional[_Iterable[int]] = ...) -> None: ...
+    distinct: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, zone: _Optional[str] = ..., inside: _Optional[_Iterable[int]] = ..., entered: _Optional[_Iterable[int]] = ..., left: _Optional[_Iterable[int]] = ..., appeared: _Optional[_Iterable[int]] = ..., lost: _Optional[_Iterable[int]] = ..., to_left: _Optional[_Iterable[int]] = ..., to_right: _Optional[_Iterable[int]] = ..., distinct: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class Events(_message.Message):
-    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "labels", "events", "zones", "delivery")
+    __slots__ = ("stream", "epoch", "seq", "stamp_ns", "sensor", "session", "revision", "labels", "events", "attributes", "zones", "delivery")
     STREAM_FIELD_NUMBER: _ClassVar[int]
     EPOCH_FIELD_NUMBER: _ClassVar[int]
     SEQ_FIELD_NUMBER: _ClassVar[int]
@@ -310,6 +328,7 @@ class Events(_message.Message):
     REVISION_FIELD_NUMBER: _ClassVar[int]
     LABELS_FIELD_NUMBER: _ClassVar[int]
     EVENTS_FIELD_NUMBER: _ClassVar[int]
+    ATTRIBUTES_FIELD_NUMBER: _ClassVar[int]
     ZONES_FIELD_NUMBER: _ClassVar[int]
     DELIVERY_FIELD_NUMBER: _ClassVar[int]
     stream: str
@@ -321,9 +340,10 @@ class Events(_message.Message):
     revision: int
     labels: _containers.RepeatedScalarFieldContainer[str]
     events: _containers.RepeatedCompositeFieldContainer[ZoneEvent]
+    attributes: _containers.RepeatedCompositeFieldContainer[Attribute]
     zones: _containers.RepeatedCompositeFieldContainer[ZoneCount]
     delivery: Delivery
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., events: _Optional[_Iterable[_Union[ZoneEvent, _Mapping]]] = ..., zones: _Optional[_Iterable[_Union[ZoneCount, _Mapping]]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., events: _Optional[_Iterable[_Union[ZoneEvent, _Mapping]]] = ..., attributes: _Optional[_Iterable[_Union[Attribute, _Mapping]]] = ..., zones: _Optional[_Iterable[_Union[ZoneCount, _Mapping]]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
 
 class Problem(_message.Message):
     __slots__ = ("stream", "instance", "code", "path", "expected", "received", "message", "seq", "stamp_ns", "count", "reported_ns")

@@ -300,6 +300,7 @@ class FrameReader:
             "velocity": _column([one.velocity for one in objects], UNKNOWN[:2]),
             "position_covariance": _column([one.position_covariance for one in objects], (UNKNOWN,) * 3),
             "embedding": _embeddings(objects),
+            "attributes": _attributes(objects),
         }
         placed = [at for at, one in enumerate(objects) if one.lat is not None or one.heading is not None]
         if placed:
@@ -345,6 +346,8 @@ class FrameReader:
         for column in ("label", "score", "yaw", "size", "velocity", "embedding"):
             if column in fields:
                 fields[column] = fields[column][rows]
+        if "attributes" in fields:
+            fields["attributes"] = _attributes([objects[row] for row in rows.tolist()])
         fields |= {column: found[column] for column in ("center", "position_covariance")}
         self._see(fields, camera)
         return list(rows.tolist())
@@ -495,6 +498,16 @@ def _column(values: list[Any], unknown: Any) -> Any:
     return np.array([unknown if value is None else value for value in values], np.float64)
 
 
+def _attributes(objects: Sequence[EdgeObject]) -> list[dict[str, Any]] | None:
+    """Return the attributes of the objects as fields of messages; None when there are none."""
+    found = []
+    for row, one in enumerate(objects):
+        for name, value in (one.attributes or {}).items():
+            text, score = (value, 1.0) if isinstance(value, str) else value
+            found.append({"row": row, "name": name, "text": text, "score": score})
+    return found or None
+
+
 def _embeddings(objects: Sequence[EdgeObject]) -> Any:
     """Return the vectors of the objects, which are of one length; None when there is none."""
     lengths = {at: len(one.embedding) for at, one in enumerate(objects) if one.embedding is not None}
@@ -516,6 +529,8 @@ def _of_object(
     if name == "labels":
         name, label = "class", fields["labels"][number]
         number = next(at for at, each in enumerate(objects) if each.name == label)
+    elif name == "attributes":
+        number, rest = rows[fields[name][number]["row"]], ""
     else:
         number = rows[number]
     one = objects[number]

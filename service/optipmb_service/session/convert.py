@@ -17,6 +17,7 @@ import numpy as np
 import optipmb_schemas as schemas
 
 import optipmb
+from optipmb.model.attributes import Readings, shown_of, words_of
 from optipmb.model.frame import Embedding, frame_of_checked
 from optipmb.model.rows import read_only
 from optipmb.model.table import ClassTable
@@ -112,7 +113,12 @@ def frame_of(
     view, looks = view_of(message, ahead), None
     if message.embedding is not None and message.embedding_model is not None:
         looks = Embedding(message.embedding_model, message.embedding)
-    return frame_of_checked(parameters, message.stamp_ns, message.labels, columns, pose, None, view, spread, looks)
+    texts, given = message.attributes or (), None
+    if texts:
+        row, score = np.array([one.row for one in texts], np.int64), np.array([one.score for one in texts], np.float64)
+        given = Readings(row, words_of([one.name for one in texts]), words_of([one.text for one in texts]), score)
+    rest = pose, None, view, spread, looks, given
+    return frame_of_checked(parameters, message.stamp_ns, message.labels, columns, *rest)
 
 
 def unknown_labels(parameters: optipmb.Parameters, message: schemas.Detections) -> dict[str, int]:
@@ -133,7 +139,12 @@ def density_of(
     density: optipmb.Density, *, stream: str, session: str, parameters: optipmb.Parameters
 ) -> schemas.Density:
     """Return the message for the Poisson components of a density."""
-    poisson = density.poisson
+    poisson, live = density.poisson, None if density.rejoining is None else density.rejoining.live
+    decided: dict[str, Any] = {}
+    if live is not None:
+        rows = live.object >= 0
+        chance = live.candidate_probability[rows].astype(np.float32)
+        decided = {"track": live.id[rows], "candidate": live.candidate[rows], "candidate_probability": chance}
     return schemas.Density(
         stream=stream,
         session=session,
@@ -144,6 +155,20 @@ def density_of(
         mean=poisson.mean,
         covariance=poisson.covariance,
         z=ClassTable.of(parameters).known_boxes(poisson.label, poisson.auxiliary)[:, 3],
+        **decided,
+    )
+
+
+def attributes_of(density: optipmb.Density, identity: Sequence[int]) -> tuple[schemas.Attribute, ...]:
+    """Return what is known of tracks by their ids."""
+    if density.attributes is None or not len(identity):
+        return ()
+    found = shown_of(density.attributes, np.array(identity, np.int64))
+    return tuple(
+        schemas.Attribute.trusted({"row": row, "name": name, "text": texts[row], "score": float(share[row])})
+        for row in range(len(identity))
+        for name, (texts, share) in found.items()
+        if texts[row]
     )
 
 
@@ -180,6 +205,8 @@ def tracks_of(result: optipmb.StepResult, stream: str, frame_id: FrameId, **fiel
     if (joined := result.joined) is not None:  # ids of tracks and products of probabilities
         probability = joined.probability.astype(np.float32)
         others |= {"object": read_only(joined.object), "object_probability": read_only(probability)}
+    if known := attributes_of(result.density, tracks.id.tolist()):
+        others["attributes"] = known
     if (paths := result.paths) is not None:
         others |= schemas.path_fields(paths.horizons, paths.mean, paths.covariance)
     if not sound:

@@ -37,6 +37,7 @@ class TrackedFrame:
         step_ns: time that conversion and tracking took.
         run: see `Session.run`.
         events: of the zones.
+        known: attributes of the objects of these.
         counts: of all zones after the frame, by zone, name of `COUNTS` and class; None: not to be published.
         final: up to where the window does not change any more.
     """
@@ -48,6 +49,7 @@ class TrackedFrame:
     step_ns: int = 0
     run: int = 0
     events: tuple[Event, ...] = ()
+    known: tuple[schemas.Attribute, ...] = ()
     counts: ZoneCounts | None = None
     final: Reached = (0, 0, "")
 
@@ -77,11 +79,16 @@ class TrackedFrame:
         if durable is not None:
             _, final_ns, session = min(self.final, durable)
             delivery = delivery | {"final_session": session, "final_ns": final_ns}
-        message = events_of(self.header, self.events, self.counts)
+        message = events_of(self.header, self.events, self.counts, self.known)
         return schemas.encode(message, delivery=schemas.Delivery.trusted(delivery))
 
 
-def events_of(header: dict[str, Any], events: Sequence[Event], counts: ZoneCounts | None) -> schemas.Events:
+def events_of(
+    header: dict[str, Any],
+    events: Sequence[Event],
+    counts: ZoneCounts | None,
+    known: tuple[schemas.Attribute, ...] = (),
+) -> schemas.Events:
     """Return the message of a frame with the header of its tracks."""
     named = (label for zone in (counts or {}).values() for by_class in zone.values() for label in by_class)
     # Of a profile that was in force before there may be classes that this one lacks.
@@ -98,6 +105,7 @@ def events_of(header: dict[str, Any], events: Sequence[Event], counts: ZoneCount
         for name, by in (counts or {}).items()
     )
     fields = header | {"labels": labels, "events": tuple(told), "zones": None if counts is None else zones}
+    fields["attributes"] = known or None
     return schemas.Events(**fields)
 
 

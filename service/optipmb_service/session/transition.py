@@ -349,6 +349,7 @@ class Transition:
             labels=self.parameters.labels,
         )
         zones, tracks.events = self._zones(before, result, frame_id.stamp_ns)
+        tracks.known = convert.attributes_of(result.density, [one.id for one in tracks.events])
         second = None if before.last is None else before.last.stamp_ns // SECOND
         if (
             self._policy.zones
@@ -399,7 +400,8 @@ class Transition:
             state = replace(state, session=before.session)
         objects = None if result.joined is None else result.joined.object
         labels = self.parameters.labels
-        state, events = observe(zones, state, stamp_ns, result.tracks, labels, self._shapes, objects)
+        gap_s = 0.0 if self._policy.rejoin is None else self._policy.rejoin.gap_s
+        state, events = observe(zones, state, stamp_ns, result.tracks, labels, self._shapes, objects, gap_s)
         return state, (*ended, *events)
 
     def _unknown(self, message: schemas.Detections, reported: frozenset[str]) -> dict[str, int]:

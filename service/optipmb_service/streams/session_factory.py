@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
-from optipmb.world.zones import MOST
+from optipmb.world.zones import MOST, Zone
 from optipmb_service.session.fixed_rate import FixedRate
 from optipmb_service.session.policy import SECOND, Policy
 from optipmb_service.session.session import Session
@@ -60,9 +60,13 @@ class SessionFactory:
         site, known = name.partition("/")[0], self._settings.zones
         sensors = self._fusion.sensors_of(name, self.profiles.sensors)
         rejoin = self._settings.rejoin_of(name)
+        zones = [self._zone(one, site if known[one].geo else "") for one in names[:MOST]]
+        if rejoin is not None:  # an object that may still return has not left
+            lasts_s = rejoin.gap_s + rejoin.decide_s + Zone.lost_s
+            zones = [replace(one, lost_s=lasts_s) if known[one.name].lost_s is None else one for one in zones]
         return replace(
             self._policy,
-            zones=tuple(self._zone(one, site if known[one].geo else "") for one in names[:MOST]),
+            zones=tuple(zones),
             sensors=sensors,
             needs_view=bool(sensors.uses) or name in self._fusion.sites,
             has_place=site in self._settings.sites,

@@ -2,6 +2,7 @@
 
 import json
 import random
+import tomllib
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from functools import partial
@@ -11,17 +12,20 @@ import gaps
 import msgpack
 import numpy as np
 import pytest
-from optipmb_schemas import Detections, Tracks, decode, encode
+from optipmb_schemas import Attribute, Detections, Events, Tracks, decode, encode
 from optipmb_schemas.json_form import tracks_json
 from optipmb_schemas.protobuf.convert import from_proto, to_proto
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
+from optipmb_service.session.convert import density_of
 from optipmb_service.session.outputs import TrackedFrame
 from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.settings import MOST_ZONES, RejoinSettings
+from optipmb_service.settings import MOST_ZONES, RejoinSettings, Settings
+from optipmb_service.streams.profiles import Fusion, Profiles
+from optipmb_service.streams.session_factory import SessionFactory
 from sessions import Merged, plain, problems, tracks
 
-from optipmb import OnlineTracker, Passage, Rejoin, generic_parameters
+from optipmb import OnlineTracker, Passage, Rejoin, Tracker, generic_parameters
 from optipmb.online import KNOWN
 from optipmb.world import zones
 from optipmb.world.zones import Event, Zone
@@ -218,13 +222,59 @@ def test_a_visit_over_a_gap_is_one() -> None:
     assert 4 * 10**9 < events[3].at_ns < 6 * 10**9
     counts = [one.counts for one in found if one.counts][-1]
     inside = {
-        name: {kind: one.get(kind, {}).get("car", 0) for kind in ("entered", "left", "inside")}
+        name: {kind: one.get(kind, {}).get("car", 0) for kind in ("entered", "distinct", "left", "inside")}
         for name, one in counts.items()
     }
-    assert inside["yard"] == {"entered": 1, "left": 0, "inside": 1}
-    assert inside["short"] == {"entered": 2, "left": 1, "inside": 1}
+    assert inside["yard"] == {"entered": 1, "distinct": 1, "left": 0, "inside": 1}
+    assert inside["short"] == {"entered": 2, "distinct": 1, "left": 1, "inside": 1}
     told = encode(found[-1].tracks)
     assert decode(told, Tracks).object is not None
+
+
+@pytest.mark.parametrize(("lost_s", "left"), [("", 0), ("lost_s = 2.0", 1)])
+def test_a_zone_waits_as_long_as_its_session_joins(lost_s: str, left: int) -> None:
+    """Without `lost_s` a visit survives each gap that is joined; a zone of a session that does not join has 2 s."""
+    text = f"""
+    [rejoin."site/node/camera"]
+    [zones.short]
+    streams = ["site/*/*"]
+    polygon = [[-5, -5], [200, -5], [200, 5], [-5, 5]]
+    {lost_s}
+    """
+    settings = Settings(**tomllib.loads(text))
+    profiles = Profiles.read("generic", {})
+    factory = SessionFactory(settings, profiles, Fusion.of(settings), Tracker, lambda *_, **__: None)
+    cars = gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0)))
+    found, _ = in_order(factory.policy(STREAM), [message_of(seq, one) for seq, one in enumerate(cars)])
+    assert sum(event.kind == "left" for one in found for event in one.events) == left
+    assert factory.policy("site/node/other").zones[0].lost_s == 2.0
+
+
+DELIVERY = {"instance": "a", "received_ns": 1, "published_ns": 2, "queue_ms": 0.0, "decode_ms": 0.0, "step_ms": 0.0}
+
+
+def test_attributes_reach_tracks_and_events() -> None:
+    """What the messages of a car say is in the tracks, also behind a gap, and in the events of a zone."""
+    cars = gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0)))
+    known = (Attribute(row=0, name="plate", text="AB 1", score=0.5),)
+    messages = [
+        message_of(seq, one | ({"attributes": known} if len(one["score"]) and one["stamp_ns"] < 10**9 else {}))
+        for seq, one in enumerate(cars)
+    ]
+    found, session = in_order(Policy(zones=(YARD,), rejoin=Rejoin()), messages)
+    told = decode(found[-1].encoded(DELIVERY), Tracks)
+    assert told.object is not None
+    assert (told.id.tolist(), told.object.tolist()) == ([2], [1])
+    assert told.attributes == (Attribute(row=0, name="plate", text="AB 1", score=1.0),)
+    (events,) = [one for one in found if any(event.kind == "stayed" for event in one.events)]
+    payload = events.encoded_events(DELIVERY, None)
+    assert payload is not None
+    assert decode(payload, Events).attributes == told.attributes
+    assert json.loads(tracks_json(told))["objects"][0]["attributes"] == {"plate": ["AB 1", 1.0]}
+    state = density_of(session.density, stream=STREAM, session=session.session, parameters=GENERIC)
+    assert state.track is not None
+    assert state.candidate is not None
+    assert (state.track.tolist(), state.candidate.tolist()) == ([2], [1])
 
 
 def test_settings_have_the_bounds_of_the_library() -> None:
