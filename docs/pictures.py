@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import sys
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
+
+import gaps
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.patches import Ellipse, Polygon, Rectangle
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.run import profiles
@@ -340,6 +344,46 @@ def draw_gap(axes: Axes) -> None:
     axes.plot(*np.column_stack((ends.end[0], found.begin[later])), color=CAR, linewidth=0.8)
 
 
+def draw_places(figure: Figure) -> None:
+    """Draw parked cars whose detections drop out, and people at declared doors and behind a pillar."""
+    parameters = optipmb.generic_parameters(gaps.CLASSES, 0.1)
+    park, wall = figure.subplots(1, 2, width_ratios=(58, 44))
+    for axes, scene, seconds in ((park, "car park", 120.0), (wall, "doors", 40.0)):
+        recording, declared = gaps.record(scene, 31, seconds), gaps.DECLARED.get(scene, {})
+        frames = (optipmb.make_frame(parameters, **one)[0] for one in recording.frames)
+        paths: dict[int, dict[int, list[np.ndarray]]] = {}
+        parked: list[np.ndarray] = []
+        for one in gaps.followed(frames, parameters, optipmb.Rejoin(**declared)).values():
+            columns = one.object.tolist(), one.id.tolist(), one.center[:, :2], one.detection.tolist()
+            for number, identity, place, detection in zip(*columns, strict=True):
+                if number >= 0 and detection >= 0:
+                    paths.setdefault(number, {}).setdefault(identity, []).append(place)
+        for polygon in declared.get("exits", ()):
+            axes.add_patch(Polygon(polygon, color=GHOST, alpha=0.25, label="exit"))
+        for tracks in paths.values():
+            ways = [np.array(way) for way in tracks.values()]
+            if axes is park and np.ptp(ways[0], axis=0).max() < STANDS_M:
+                axes.add_patch(Rectangle(ways[0][0] - (1.0, 2.2), 2.0, 4.4, color=CAR, alpha=0.3))
+                aside = next((one for one in parked if np.linalg.norm(one - ways[0][0]) < STANDS_M), None)
+                place = ways[0][0] + (0.0, 0.8 if aside is None else -0.8)
+                axes.annotate(str(len(ways)), place, ha="center", va="center", fontsize=8)
+                parked.append(ways[0][0])
+                continue
+            for way in ways:
+                axes.plot(*way.T, color=TRUTH if axes is park else CAR, linewidth=1)
+                axes.plot(*way[0], "o", color=CAR, markersize=3, fillstyle="none")
+            for before, after in itertools.pairwise(ways):
+                axes.plot(*np.column_stack((before[-1], after[0])), ":", color=GHOST, linewidth=1.2)
+        axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)")
+    park.set(title="ids of each parked car, which is one object", xlim=(-30, 29), ylim=(0, 30))
+    wall.add_patch(Rectangle((-0.7, 5.0), 1.4, 1.0, color=TRUTH, label="pillar"))
+    wall.set(title="doors: none who comes out went in", xlim=(-22, 22), ylim=(2, 15))
+
+
+STANDS_M = 2.0
+"""Places of a parked car lie nearer together."""
+
+
 def main(folder: Path) -> None:
     """Write the pictures into a folder."""
     draw_runs(folder)
@@ -354,6 +398,10 @@ def main(folder: Path) -> None:
     axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", xlim=(-1, 61), ylim=(-17, 15))
     axes.legend(frameon=False, fontsize=9, loc="lower left")
     figure.savefig(folder / "gaps.png", dpi=110, metadata={"Software": None})
+    figure = Figure(figsize=(10.0, 3.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    draw_places(figure)
+    figure.savefig(folder / "gaps-places.png", dpi=110, metadata={"Software": None})
     tracks, found = scene()
     figure = Figure(figsize=(6.0, 4.6), layout="constrained")
     FigureCanvasAgg(figure)
