@@ -237,7 +237,20 @@ def generated(seeds: Sequence[int], how: How, scenes: Sequence[str]) -> None:
         line(f"{low:g} to {min(high, 1.0):g}", len(known), f"{100.0 * known[:, 1].mean():.0f}" if len(known) else "-")
 
 
-def recorded(root: Path | None, frames: int, how: How) -> None:
+def cut_out(frames: Sequence[Frame], seconds: float) -> list[Frame]:
+    """Return frames of which every third part of so many seconds has no detections."""
+    arrays = ("center", "size", "yaw", "velocity", "score", "label", "source")
+    found, first_ns = [], frames[0].stamp_ns
+    for one in frames:
+        if int((one.stamp_ns - first_ns) * 1e-9 / seconds) % 3 == 2:
+            none = {name: getattr(one, name)[:0] for name in arrays}
+            found.append(replace(one, **none, position_covariance=None, embedding=None))  # type: ignore[arg-type]
+        else:
+            found.append(one)
+    return found
+
+
+def recorded(root: Path | None, frames: int, how: How, cut_s: float) -> None:
     """Print the table of the traffic of the product and, with a root, of KITTI and nuScenes."""
     cells = (
         "data",
@@ -263,6 +276,7 @@ def recorded(root: Path | None, frames: int, how: How) -> None:
             parameters = profiles.profile_for("auto", [sequence])
             given = list(sequence.frames())
             made = [tracker_frame(parameters, sequence.name, one) for one in given]
+            made = cut_out(made, cut_s) if cut_s else made
             truth = sequence.truth()
             if truth is None:
                 raise SystemExit(f"{sequence.name}: no annotations")
@@ -297,6 +311,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))
     parser.add_argument("--vectors", type=float, default=0.0, help="length of what changes in them, as 1.25")
     parser.add_argument("--lasts", action="store_true", help="with --vectors: that changes over gaps only")
+    parser.add_argument("--cut", type=float, default=0.0, help="of recordings, cut out gaps of so many seconds")
     parser.add_argument("--min-probability", type=float, help="default: that of the product")
     given = parser.parse_args()
     default = optipmb.Rejoin.min_probability if given.online else RejoinOptions.min_probability
@@ -306,7 +321,7 @@ def main() -> None:
         if given.online:
             sites(given.seeds, how.least)
     if given.frames:
-        recorded(given.root, given.frames, how)
+        recorded(given.root, given.frames, how, given.cut)
 
 
 if __name__ == "__main__":

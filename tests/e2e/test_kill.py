@@ -16,7 +16,7 @@ from optipmb_client import Connection
 from optipmb_client.incoming import Inbox
 from optipmb_schemas import Detections
 from optipmb_service.session.policy import Policy
-from optipmb_service.settings import ZoneSettings
+from optipmb_service.settings import RejoinSettings, ZoneSettings
 from real_data import kitti_root
 from recorded import KEYS, Recording, Replay, kitti
 from sessions import undisturbed
@@ -33,12 +33,26 @@ RESTART_S = 200.0  # on a machine that is busy with other things
 SEQUENCES = ("0000", "0002", "0004", "0011", "0003", "0005", "0007", "0009", "0017", "0020")[: 10 if KILLS > FEW else 4]
 EVENTS_S = 30.0
 ZONES: dict[str, dict[str, Any]] = {
-    f"zone-{x}-{y}": {"streams": ["*/kitti/*"], "polygon": [[x, y], [x + 18, y], [x + 18, y + 12], [x, y + 12]]}
+    f"zone-{x}-{y}": {
+        "streams": ["*/kitti/*"],
+        "polygon": [[x, y], [x + 18, y], [x + 18, y + 12], [x, y + 12]],
+        "lost_s": 2.0,
+    }
     for x in (0, 20, 40, 60)
     for y in (-12, 0)
-} | {f"line-{x}": {"streams": ["*/kitti/*"], "line": [[x, -20], [x, 20]]} for x in range(5, 85, 10)}
+} | {f"line-{x}": {"streams": ["*/kitti/*"], "line": [[x, -20], [x, 20]], "lost_s": 2.0} for x in range(5, 85, 10)}
 """Eight zones and eight lines where the recorded vehicles start."""
-JOINS = optipmb.Rejoin(min_probability=0.6, embedding_model="sizes")
+JOINS: dict[str, Any] = {
+    "min_probability": 0.6,
+    "decide_s": 0.1,
+    "embedding_model": "sizes",
+    "exits": [[[0, 4], [15, 4], [15, 20], [0, 20]]],
+    "passages": [
+        {"from": [[0, -9], [30, -9], [30, 4], [0, 4]], "to": [[0, -9], [60, -9], [60, 4], [0, 4]], "s": [1, 9]}
+    ],
+}
+HIDDEN = range(5, 37)
+"""Frames in which nothing is detected, of every second recording."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -46,19 +60,32 @@ def _compiled() -> None:
     optipmb.warm_up(rejoin=True)
 
 
-def with_vectors(recording: Recording) -> Recording:
-    """Return a recording whose detections have their sizes as vectors of appearance."""
-    frames = [
-        (Detections(**dict(one.present()) | {"embedding": one.size, "embedding_model": "sizes"}), points)
-        for one, points in recording.frames
-    ]
+def with_looks(recording: Recording, hidden: range) -> Recording:
+    """Return a recording whose detections have their sizes as vectors of appearance and attributes, but for a gap."""
+    frames = []
+    for at, (one, points) in enumerate(recording.frames):
+        fields: dict[str, Any] = dict(one.present()) | {"embedding": one.size, "embedding_model": "sizes"}
+        if at in hidden:
+            fields |= {name: fields[name][:0] for name in one.arrays if fields.get(name) is not None}
+        heights = enumerate(fields["size"][:, 2].round(1).tolist())
+        fields["attributes"] = [
+            {"row": row, "name": "height", "text": str(high), "score": 0.3} for row, high in heights
+        ]
+        frames.append((Detections(**fields), points))
     return replace(recording, frames=frames)
+
+
+def recordings_of(root: Path, round_: int) -> list[Recording]:
+    """Return the recordings of a round."""
+    streams = [kitti(root, name, f"round{round_}/kitti/{name}", FRAMES) for name in SEQUENCES]
+    return [with_looks(one, HIDDEN if at % 2 else range(0)) for at, one in enumerate(streams)]
 
 
 def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Fault 1: four recorded streams, SIGKILL in the middle, a new process: all is as without a kill.
 
-    The tracks of every frame and their objects, repetitions set aside, the digest of the state and the events of zones
+    Vehicles are joined over gaps, with exits, passages, vectors and attributes. The tracks of every frame and their
+    objects, repetitions set aside, the digest of the state and the events of zones
     are byte-equal to an undisturbed session; events that were final did not change. Every round has a moment of its
     own.
     """
@@ -68,15 +95,14 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
     repeated = 0
     waits = {"cloud_wait_s": 30, "recovery_wait_s": 10, "checkpoint_s": 0.2}
     zones = tuple(ZoneSettings(**one).zone(name) for name, one in sorted(ZONES.items()))
-    final, number = 0, 0
+    final, number, rejoined = 0, 0, 0
     settings = {"zones": json.dumps(ZONES), "profile": "kitti", "queue_clouds": FRAMES, "stream_mb": 1024} | waits
-    joins = {"min_probability": JOINS.min_probability, "embedding_model": JOINS.embedding_model}
-    settings["rejoin"] = json.dumps({"*/kitti/*": joins})
-    policy = Policy(zones=zones, rejoin=JOINS)
+    settings["rejoin"] = json.dumps({"*/kitti/*": JOINS})
+    policy = Policy(zones=zones, rejoin=RejoinSettings(**JOINS).joining())
     with Fleet(tmp_path, **settings) as fleet, Connection(fleet.endpoint) as connection:
         service = fleet.service("one")
         for round_ in range(KILLS):
-            recordings = [with_vectors(kitti(root, name, f"round{round_}/kitti/{name}", FRAMES)) for name in SEQUENCES]
+            recordings = recordings_of(root, round_)
             replay = Replay(connection, recordings, pace_s=0.004)
             inbox = Inbox(100_000)
             keys = [key(one.stream) for one in recordings for key in (KEYS.tracks, KEYS.events)]
@@ -100,7 +126,8 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
                 state = replay.state(recording.stream)
                 assert (state.digest, state.frames, state.gaps) == (digest, FRAMES, 0), (round_, SEED)
                 assert replay.wait_events(recording.stream, events, EVENTS_S), (round_, SEED)
-                final, number = final + len(result.final), number + len(events)
+                more = len(result.final), len(events), state.rejoined or 0
+                final, number, rejoined = final + more[0], number + more[1], rejoined + more[2]
                 repeated += result.repeated
             if KILLS > FEW:
                 _tell(capsys, f"kill {round_ + 1} of {KILLS}: outage {outages[-1]:.2f} s")
@@ -112,6 +139,7 @@ def test_killed_at_random_moments(tmp_path: Path, capsys: pytest.CaptureFixture[
             reader.join(60)
             replay.close()
         assert service.end()[0] == 0
+    assert rejoined
     _tell(
         capsys,
         f"{KILLS} of {KILLS} kills: all tracks and events byte-equal (seed {SEED}); "

@@ -77,7 +77,7 @@ def undisturbed(
     for one in messages:
         outputs += session.on_detections(one, 0) if isinstance(one, Detections) else session.on_points(one, 0)
     tracked = [one for one in outputs if isinstance(one, TrackedFrame)]
-    events = [bare_events(events_of(one.header, one.events, None)) for one in tracked if one.events]
+    events = [bare_events(events_of(one.header, one.events, None, one.known)) for one in tracked if one.events]
     return [plain(one) for one in tracks(outputs)], digest_of(session.snapshot()), events
 
 
