@@ -324,9 +324,34 @@ def test_results_may_have_objects_as_ids(table: Path, tmp_path: Path, capsys: py
     assert len(objects) == 2
 
 
+EXIT = '[rejoin."*"]\nexits = [[[20, -2], [30, -2], [30, 2], [20, 2]]]\n'
+WAY = """
+[[rejoin."*".passages]]
+from = [[20, -2], [30, -2], [30, 2], [20, 2]]
+to = [[15, 34], [25, 34], [25, 46], [15, 46]]
+s = [2, 8]
+"""
+
+
+@pytest.mark.parametrize(("text", "path", "expected"), [
+    (EXIT, (0, 0, 8, 0), [1, 2]),
+    (EXIT.replace("20,", "90,").replace("30,", "99,"), (0, 0, 8, 0), [1, 1]),
+    (WAY, (20, 104, 0, -8), [1, 1]),
+    (WAY.replace("[2, 8]", "[6, 8]"), (20, 104, 0, -8), [1, 2]),
+])  # fmt: skip
+def test_places_hold_for_recordings(text: str, path: Any, expected: list[int], tmp_path: Path) -> None:
+    """What is lost in an exit of the file is not joined; a passage joins its ends within its time."""
+    (tmp_path / "settings.toml").write_text(text)
+    frames = gaps.cars((0, 3, (0, 0), (8, 0)), (8, 10, path[:2], path[2:]))
+    how = RejoinOptions(60.0, 0.9, *rejoining.places_in(tmp_path / "settings.toml"))
+    assert how.objects(gaps.tracked(frames, GENERIC), GENERIC).object.tolist() == expected
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [
+        (("track", "{table}", "--places", "{table}", "--out", "{out}.csv"), "expected --rejoin"),
+        (("track", "{table}", "--rejoin", "--places", "{table}", "--out", "{out}.csv"), "one table [rejoin.PATTERN]"),
         (("track", "{table}", "--rejoin", "--out", "{out}"), "--rejoin: expected --ids object or a table as --out"),
         (("track", "{table}", "--ids", "object", "--out", "{out}.csv"), "expected track, or object with --rejoin"),
         (("track", "{table}", "--rejoin", "0", "--out", "{out}.csv"), "expected a time in (0, 600] s, received 0"),

@@ -124,6 +124,16 @@ def test_tracks_are_boxes_of_their_colour_with_id_and_existence() -> None:
     assert log.column(f"{path}/velocity", "vectors")[0] == [2.0, 1.0, 0.0]
 
 
+def test_tracks_of_an_object_are_one_in_views() -> None:
+    """Where tracks are joined over gaps, label and colour are those of the object, as soon as it is decided."""
+    log = Log()
+    joined = {"object": np.array([3, 4, -1]), "object_probability": np.ones(3, np.float32)}
+    View(log).show(tracks(1, [3, 10, 11]).model_copy(update=joined))  # type: ignore[arg-type]  # as above
+    assert log.column(f"{STREAM}/tracks", "labels")[:2] == ["3 0.75", "4 0.75"]
+    red, green, blue = rgb_of(4)
+    assert log.column(f"{STREAM}/tracks", "colors")[1] == red << 24 | green << 16 | blue << 8 | 255
+
+
 def test_ellipses_are_two_standard_deviations_long_and_turned() -> None:
     """The covariance of the position is drawn along its own axes, for any other states."""
     turn, long, short = 0.6, 3.0, 0.5

@@ -12,6 +12,7 @@ from socket import SO_RCVBUF, SOL_SOCKET
 from socket import create_connection as create_socket
 from typing import Any
 
+import numpy as np
 import pytest
 import structlog
 from geojson_pydantic import FeatureCollection
@@ -182,6 +183,16 @@ def test_a_map_gets_the_newest_tracks_as_points(session: Session, watched: Watch
         assert "class" not in few["properties"]
         assert get(address, "tracks?stream=other/*/*&format=geojson")[1]["error"]["path"] == "sites"
         assert get(address, f"{query}&format=kml")[1]["error"]["path"] == "format"
+
+
+def test_a_feature_has_the_id_of_its_object(session: Session, watched: Watched) -> None:
+    """Where tracks are joined over gaps, ids of features are those of objects, whatever fields are asked for."""
+    known = {"id": np.array([5, 8]), "object": np.array([3, -1]), "object_probability": np.ones(2, np.float32)}
+    joined = tracks(3).model_copy(update=known)
+    session.cache = [(key_of(joined), joined)]
+    with served(watched, {"garage": Georeference((48.0, 11.0, 500.0)).to_geographic}) as address:
+        found = get(address, f"tracks?stream={ALL}&confirmed=0&format=geojson&fields=speed")[1]["features"]
+    assert [feature["id"] for feature in found] == [f"{STREAM}/3", f"{STREAM}/8"]
 
 
 def test_the_newest_frame_is_that_of_the_latest_run(session: Session, address: str) -> None:

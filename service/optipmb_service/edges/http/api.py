@@ -464,7 +464,7 @@ class Api:
         if nowhere := [one.message.stream for one in newest if one.place is None]:
             raise schemas.MessageError("invalid_value", "sites", f"the place of the site of {nowhere[0]}", "none")
         if selection.fields:
-            selection = msgspec.structs.replace(selection, fields=selection.fields | {"lat", "lon", "alt"})
+            selection = msgspec.structs.replace(selection, fields=selection.fields | {"lat", "lon", "alt", "object"})
         text = features_json(one.tracks(selection, self._readers.stale_s) for one in newest)
         return Response(text, media_type="application/geo+json", headers=HEADERS)
 
