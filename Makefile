@@ -31,7 +31,7 @@ help:
 	@echo "make paths   go the first ten minutes of six users, from empty environments with the wheel, and print what they take"
 	@echo "make repeat  run make test N=10 times in fresh clones, with LOAD=0 processes that compute beside it"
 	@echo "make bench   time the tracker, its kernels, the codec and the service, beside the saved baseline"
-	@echo "make figures measure the tracker's figures of docs/performance.md, beside other trackers, and write the page"
+	@echo "make figures measure the tracker's figures of docs/performance.md, beside other trackers, and draw its plots"
 	@echo "make compare evaluate the tracks of two other trackers beside ours, on the sample"
 	@echo "make load    measure what the service carries on this machine, as docs/performance.md has it"
 	@echo "make kills   kill the service a hundred times while recorded frames stream through it, and compare (needs KITTI)"

@@ -1,7 +1,7 @@
 """All figures of docs/performance.md in one run: `python benchmarks/figures.py [--peers PYTHON] [--docs]`.
 
 Every figure that is compared with another is measured in turns with it, so that what else the machine does hits both.
-Prints the tables; `--docs` writes them, and the plots, into the page. `--peers` names the interpreter of an environment
+Prints the tables; `--docs` draws the plots of the page. `--peers` names the interpreter of an environment
 with the trackers of `peers.py`. Recorded sequences are left out where their data are not there.
 """
 
@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 FOLDER = Path(__file__).resolve().parent
-PAGE = FOLDER.parent / "docs" / "performance.md"
-IMAGES = PAGE.parent / "images"
+IMAGES = FOLDER.parent / "docs" / "images"
 OBJECTS = (10, 20, 50, 100, 200, 400, 800)
 POINTS = (0, 30_000, 120_000)
 BOXES = 100
@@ -208,10 +207,10 @@ def tables(found: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Measure, print, and write the page if asked."""
+    """Measure, print, and draw the plots if asked."""
     parser = argparse.ArgumentParser(description="All figures of docs/performance.md in one run.")
     parser.add_argument("--peers", metavar="PYTHON", help="interpreter of an environment with other trackers")
-    parser.add_argument("--docs", action="store_true", help="write tables and plots into docs/performance.md")
+    parser.add_argument("--docs", action="store_true", help="draw the plots of docs/performance.md")
     parser.add_argument("--json", type=Path, help="also write all figures to this file")
     chosen = parser.parse_args()
     optipmb.warm_up()
@@ -222,14 +221,10 @@ def main() -> None:
     found["growth"] = growth(found["dense"][PROFILES[0]])
     found["peers"] = peers(chosen.peers) if chosen.peers else {}
     found["shares"] = share_of_kernels()
-    text = tables(found)
-    print(text)
+    print(tables(found))
     if chosen.json:
         chosen.json.write_text(json.dumps(found, indent=1), encoding="utf-8")
     if chosen.docs:
-        page = PAGE.read_text(encoding="utf-8")
-        head, rest = page.split("<!-- figures -->\n")[0], page.split("<!-- end of figures -->\n")[1]
-        PAGE.write_text(f"{head}<!-- figures -->\n{text}<!-- end of figures -->\n{rest}", encoding="utf-8")
         draw(found, IMAGES)
 
 
