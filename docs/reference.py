@@ -184,7 +184,7 @@ def settings() -> str:
             if f"{prefix}{name}" not in {"limits", "mqtt", "ros2"}
         }
     nested = {prefix.strip("."): f"{prefix}{next(iter(table.model_fields))}" for prefix, table in tables if prefix}
-    return _sections(SETTINGS | nested, ("setting", "default", "allowed", "meaning"), rows)
+    return _sections(SETTINGS | nested, ("setting", "default; allowed", "meaning"), rows)
 
 
 def docstrings(table: type) -> dict[str, str]:
@@ -221,7 +221,7 @@ def metrics() -> str:
     return _sections(METRICS_OF, ("metric", "meaning"), rows)
 
 
-def _setting(name: str, field: FieldInfo, meaning: str) -> tuple[str, str, str, str]:
+def _setting(name: str, field: FieldInfo, meaning: str) -> tuple[str, str, str]:
     default = field.get_default(call_default_factory=False) if field.default_factory is None else None
     shown = "required" if field.is_required() else "" if default in (None, (), "") else f"`{_plain(default)}`"
     bounds = {
@@ -232,10 +232,10 @@ def _setting(name: str, field: FieldInfo, meaning: str) -> tuple[str, str, str, 
     }
     allowed = _interval(bounds)
     if get_origin(field.annotation) is Literal:
-        allowed = ", ".join(f"`{choice}`" for choice in get_args(field.annotation))
+        allowed = ", ".join(f"`{choice}`" for choice in get_args(field.annotation) if choice != default)
     if len(allowed) > MOST_ALLOWED:
-        return f"`{name}`", "", "", f"{meaning}: {allowed}; default: {shown}"
-    return f"`{name}`", shown, allowed, meaning
+        return f"`{name}`", shown, f"{meaning}: {allowed}"
+    return f"`{name}`", "; ".join(filter(None, (shown, allowed))), meaning
 
 
 def _interval(bounds: dict[str, Any]) -> str:

@@ -22,7 +22,6 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 from optipmb_schemas import json_form
 from optipmb_schemas.codec import MAJOR, MESSAGES, encoding_of
 from optipmb_schemas.control import MemberSummary, SessionState, SessionSummary
-from optipmb_schemas.errors import CODES
 from optipmb_schemas.limits import DEFAULT
 from optipmb_schemas.messages import (
     Attribute,
@@ -95,8 +94,6 @@ def table(name: str) -> str:
     """Return one table as Markdown lines."""
     if name == "limits":
         return _markdown(("limit", "default", "of"), ((f"`{n}`", f"{v:,}", text) for n, v, text in DEFAULT.described()))
-    if name == "codes":
-        return _markdown(("code", "meaning"), ((f"`{code}`", text) for code, text in CODES.items()))
     return _markdown(("field", "type", "meaning"), _rows(_KIND[name]))
 
 

@@ -43,26 +43,26 @@ def dumped(text: str) -> bytes:
 
 
 def test_the_tables_are_current(capsys: pytest.CaptureFixture[str]) -> None:
-    """The tables of fields, limits and codes are current, and the command reports when they are not."""
+    """The tables of fields and limits are current, and the command reports when they are not."""
     assert fill(PAGE) == PAGE
     assert main(["--check", "--page", str(FILE), str(ROOT / "schemas" / "json")]) == 0, capsys.readouterr().out
-    assert fill("<!-- table: codes -->\nold\n<!-- end -->") == f"<!-- table: codes -->\n{table('codes')}<!-- end -->"
+    assert fill("<!-- table: limits -->\nold\n<!-- end -->") == f"<!-- table: limits -->\n{table('limits')}<!-- end -->"
 
 
 def test_a_stale_page_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """`--page` with `--check` finds a stale table, and without it brings the page up to date."""
     page, folder = tmp_path / "page.md", tmp_path / "json"
-    page.write_text("<!-- table: codes -->\n<!-- end -->\n")
+    page.write_text("<!-- table: limits -->\n<!-- end -->\n")
     assert main([str(folder)]) == 0
     assert main(["--check", "--page", str(page), str(folder)]) == 1
     assert "page.md: not up to date" in capsys.readouterr().out
     assert main(["--page", str(page), str(folder)]) == 0
     assert main(["--check", "--page", str(page), str(folder)]) == 0
-    assert "invalid_value" in page.read_text()
+    assert "max_points" in page.read_text()
 
 
 def test_every_message_has_its_table() -> None:
-    """No message type, and neither the limits nor the codes, are missing on the page."""
+    """No message type and no limits are missing on the page."""
     named = set(re.findall(r"<!-- table: (\w+) -->", PAGE))
     assert named >= {kind.__name__ for kind in MESSAGES} | {
         "Pose",
@@ -70,7 +70,6 @@ def test_every_message_has_its_table() -> None:
         "Delivery",
         "SessionSummary",
         "limits",
-        "codes",
     }
 
 
