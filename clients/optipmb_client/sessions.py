@@ -1,6 +1,7 @@
 """Asking the service: parameters, reset, state and kept tracks of a stream's session, and the services themselves."""
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import TypeVar
@@ -59,18 +60,19 @@ def set_parameters(
     *,
     prefix: str = PREFIX,
     patience_s: float = 10.0,
+    stop: threading.Event | None = None,
 ) -> SessionParameters:
     """Set the parameters of a stream's session, which starts it; return those in force.
 
     Raises:
-        ServiceUnavailable: No service answered within `patience_s` seconds.
+        ServiceUnavailable: No service answered within `patience_s` seconds, or before `stop` was set.
         ServiceRefused: A service answered that it will not; the text says why.
     """
     deadline = time.monotonic() + patience_s
     while (
         in_force := _ask(connection, Keys(prefix).query(stream, "parameters"), SessionParameters, parameters)
     ) is None:
-        if time.monotonic() >= deadline:
+        if time.monotonic() >= deadline or (stop is not None and stop.is_set()):
             raise ServiceUnavailable(
                 f"no tracking service answered for {patience_s:g} s; is optipmb-service running, with the same prefix?"
             )

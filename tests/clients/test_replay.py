@@ -217,6 +217,27 @@ def test_an_interrupt_says_what_is_complete(
     assert [path.name for path in tmp_path.glob("*.txt")] == ["0000.txt"]
 
 
+@pytest.mark.timeout(60)
+def test_an_interrupt_ends_the_wait_for_a_service(
+    link: Connection, dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where no service answers, a replay that would wait for an hour ends when it is interrupted."""
+    asked = threading.Event()
+
+    def unanswered(*_: object, **__: object) -> list[object]:
+        asked.set()
+        return []
+
+    def interrupted(*_: object) -> None:
+        assert asked.wait(30)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(link, "query", unanswered)
+    monkeypatch.setattr("concurrent.futures.wait", interrupted)
+    with pytest.raises(KeyboardInterrupt, match="0 of 1 recordings"):
+        run(link, dataset, tmp_path, pace=replace(QUICK, service_s=3600.0))
+
+
 def test_one_failing_sequence_ends_the_others_and_closes_their_sessions(
     endpoint: str, link: Connection, dataset: Dataset, tmp_path: Path
 ) -> None:

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Annotated, Any
 
 import typer
@@ -46,8 +47,11 @@ def _out(out: Path) -> Path:
     folder = place if place.is_dir() else place.parent
     if place != out and not place.is_dir():
         raise UsageError(f"--out {out}: expected a place in a folder, but {place} is a file")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise UsageError(f"--out {out}: {folder} cannot be written to")
+    try:
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise UsageError(f"--out {out}: {folder} cannot be written to: {error.strerror}") from None
     known = suffix in (*SUFFIXES, *FEATURES, ".mcap") or is_openlabel(out)
     if not out.is_dir() and not known and re.fullmatch(r"\.[a-z]{2,}[a-z0-9]*", suffix):
         raise UsageError(f"--out {out}: expected a folder, or a table ({', '.join((*SUFFIXES, *FEATURES, OPENLABEL))})")

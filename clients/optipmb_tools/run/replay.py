@@ -258,10 +258,12 @@ class _Replay:
                 cloud_wait_s=CLOUD_WAIT_S,
                 horizons=None if horizons is None else np.array(horizons),
             )
-            set_parameters(self.connection, self.stream, wanted, prefix=prefix, patience_s=pace.service_s)
+            set_parameters(
+                self.connection, self.stream, wanted, prefix=prefix, patience_s=pace.service_s, stop=self.stop
+            )
             try:
                 if self.sequence.has_clouds:
-                    await_wanted(lambda: publisher.points_wanted)
+                    await_wanted(lambda: publisher.points_wanted or self.stop.is_set())
                 self._publish_all(publisher)
                 self.exchange.drain(lambda: len(self.exchange.results) >= len(self._index_of))
             finally:
