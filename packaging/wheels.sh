@@ -17,13 +17,14 @@ if [ $# -eq 0 ]; then
     done
   done
 fi
+source=$(ls "$dist"/optipmb-*.tar.gz 2>/dev/null || echo "$root") # the archive at a release
 work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT INT TERM
 for python; do
   rm -rf "$work/venv" "$work/cache" "$work/code"
   "$python" -m venv "$work/venv"
   pip="$work/venv/bin/python -m pip --quiet --disable-pip-version-check"
-  $pip install "$dist"/optipmb-*-none-any.whl
+  $pip install --find-links "$dist" "$dist"/optipmb-*-none-any.whl
   export NUMBA_CACHE_DIR="$work/cache" NUMBA_CPU_NAME=x86-64-v2 NUMBA_CPU_FEATURES=
   (cd "$work" && venv/bin/python -c 'import optipmb; optipmb.warm_up(rejoin=True)')
   # Kernels that kernels alone call are compiled into those: what a second process loads is enough.
@@ -34,5 +35,5 @@ optipmb.warm_up(rejoin=True)
 print(*(".".join(name.split(".")[-2:]) for name, one in optipmb.warm.kernels().items() if one.stats.cache_hits))'); do
     cp "$work"/cache/*/"$kernel"-*.nb[ci] "$work/code"
   done
-  OPTIPMB_MACHINE_CODE=$work/code $pip wheel --no-deps --wheel-dir "$dist" "$root"
+  OPTIPMB_MACHINE_CODE=$work/code $pip wheel --no-deps --wheel-dir "$dist" "$source"
 done

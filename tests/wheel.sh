@@ -3,7 +3,7 @@
 # is not there, so that a file missing from the wheel shows, and nothing may be compiled. Called as: sh tests/wheel.sh PYTHON BIN DIST
 #   PYTHON  interpreter that makes the fresh environment
 #   BIN     folder of an environment with pip
-#   DIST    folder with the wheel without machine code
+#   DIST    folder with both wheels, without machine code
 set -eu
 python=$1
 case $2 in /*) bin=$2 ;; *) bin=$PWD/$2 ;; esac
@@ -12,6 +12,7 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT INT TERM
 mkdir "$work/dist" "$work/home"
 cp "$3"/optipmb-*-none-any.whl "$work/dist"
+node=$(cd "$3" && ls "$PWD"/optipmb_node-*.whl)
 PIP_CONSTRAINT=$root/requirements.lock sh "$root/packaging/wheels.sh" "$work/dist" "$python"
 wheel=$(ls "$work"/dist/optipmb-*-manylinux*.whl)
 
@@ -45,4 +46,13 @@ PYTHON
 "$work/venv/bin/optipmb" track --dataset scene --option frames=5 --out "$work/out" >/dev/null
 test -s "$work/out/0000.txt"
 "$bin/python" -m pip --python "$work/venv/bin/python" check --disable-pip-version-check
+
+# At a release the two packages share no file: one can be removed, and the other still imports.
+"$bin/python" -m build --outdir "$work/release" "$root" >/dev/null
+"$bin/python" -m pip --python "$work/venv/bin/python" install --quiet --no-deps --force-reinstall \
+  "$work"/release/optipmb-*-none-any.whl "$node"
+"$work/venv/bin/python" -c 'import optipmb_tools, optipmb_client'
+"$bin/python" -m pip --python "$work/venv/bin/python" check --disable-pip-version-check
+"$bin/python" -m pip --python "$work/venv/bin/python" uninstall --quiet --yes optipmb
+"$work/venv/bin/python" -c 'import optipmb_client, optipmb_schemas; assert optipmb_client.Publisher'
 echo "the wheel $(basename "$wheel") works by itself"
