@@ -393,7 +393,7 @@ function tell() {
     "track": track[ID], ...(track[OBJECT] >= 0 ? { "object": track[OBJECT] } : {}), ...(globalId(track) ? { "global id": globalId(track) } : {}), "class": frame.labels[track[LABEL]],
     "existence": track[EXISTENCE].toFixed(3), "score": track[SCORE].toFixed(2),
     "speed": `${Math.hypot(track[VX], track[VY]).toFixed(1)} m/s`, "x, y": `${track[X].toFixed(1)}, ${track[Y].toFixed(1)} m`,
-    "faces": `${(track[YAW] * 180 / Math.PI).toFixed(0)}° at ${(100 * track[FACING]).toFixed(1)} %`,
+    "faces": `${Math.round(track[YAW] * 180 / Math.PI)}° at ${(100 * track[FACING]).toFixed(1)} %`,
     "age": `${track[AGE].toFixed(1)} s`, "last detected": track[MISSED] > 0 ? `${track[MISSED].toFixed(1)} s ago` : "now",
   };
   const place = frame.geographic && frame.geographic[frame.tracks.indexOf(track)];
