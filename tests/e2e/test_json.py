@@ -27,8 +27,9 @@ from service_process import ServiceProcess
 from watched import plain
 from websocket import create_connection
 
-PAGE = Path(__file__).parents[2] / "examples/json/index.html"
-JSON_PAGE = Path(__file__).parents[2] / "docs/json.md"
+REPOSITORY = Path(__file__).parents[2]
+PAGE = REPOSITORY / "examples/json/index.html"
+JSON_PAGE = REPOSITORY / "docs/json.md"
 SENSOR = Sensor()
 FRAMES = 30
 CONFIRMED = Selection(confirmed=True)
@@ -122,13 +123,13 @@ async def test_every_edge_gives_the_text_of_the_published_tracks(service: Servic
 def test_a_car_drives_through_a_zone_by_curl_and_mosquitto_pub_alone(tmp_path: Path) -> None:
     """The commands of the page, at the speed of this machine: both streams have the events, and no log has an error."""
     section = JSON_PAGE.read_text().partition("### A car through a zone\n")[2].partition("\n#")[0]
-    (tmp_path / "garage.toml").write_text(re.findall(r"```toml\n(.*?)```", section, re.DOTALL)[0])
-    _, programs, senders = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)
-    starting, bridging, reading = programs.splitlines()
+    _, programs = re.findall(r"```sh\n(.*?)```", section, re.DOTALL)
+    starting, bridging, reading, driving = programs.splitlines()
+    senders = (REPOSITORY / driving.split()[1]).read_text()
     senders = senders.replace("sleep 0.1", ":").replace("$(date +%s%N)", "$((1795766400000000000 + x * 100000000))")
-    settings = ("--settings", str(tmp_path / "garage.toml"))
-    assert starting.split() == ["optipmb-service", "--settings", "garage.toml", "--http", "127.0.0.1:8080"]
-    assert bridging.split()[:4] == ["optipmb-service", "mqtt", "--settings", "garage.toml"]
+    settings = ("--settings", str(REPOSITORY / starting.split()[2]))
+    assert starting.split()[3:] == ["--http", "127.0.0.1:8080"]
+    assert bridging.split()[:4] == ["optipmb-service", "mqtt", *starting.split()[1:3]]
     with (
         mosquitto(tmp_path) as broker,
         ServiceProcess(*settings, "--http", "127.0.0.1:0", "--log-format", "json") as service,
