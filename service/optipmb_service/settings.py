@@ -365,8 +365,8 @@ class FusedSettings(BaseModel):
     streams: Patterns = Field(min_length=1, max_length=64)
     """patterns of streams of one site (as `garage/*/radar`) that feed it; a stream feeds one session"""
     read: tuple[Node, ...] = ()
-    """nodes (as `garage/kiosk`) that may read it over gRPC and HTTP with a certificate or token, besides viewers and
-    services; in a protected network `make.py --reads` lets them"""
+    """nodes (as `garage/kiosk`) that may read it over gRPC and HTTP, besides viewers and services; in a protected
+    network see `make.py --reads`"""
 
     @field_validator("streams")
     @classmethod
@@ -490,16 +490,14 @@ class InputSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     format: Literal["optipmb", "axis", "frigate", "scenescape", "mapped"] = "optipmb"
-    """form of payloads: our JSON, a known maker's, or that which `mapping` describes; of a maker's the topic of MQTT or
-    the address of HTTP names the stream"""
+    """form of payloads: our JSON, a known maker's, or that which `mapping` describes"""
     mapping: MappingSettings | None = None
     """paths of a payload, for the format `mapped`"""
     only: dict[PathText, bool | int | str] = Field(default_factory=dict)
-    """values by their paths in the payload; other payloads are refused, over MQTT left out, or of another input of the
-    topic; for the format `frigate` the camera of the stream, as `{ "after.camera" = "gate" }`"""
+    """values by their paths in the payload, as `{ "after.camera" = "gate" }`; other payloads are refused, over
+    MQTT left out or of another input of the topic"""
     clock: Literal["sender", "arrival", "offset"] = "sender"
-    """stamps of frames: the sender's; those of their arrival; or the sender's moved to the clock of this machine, which
-    keeps their intervals and puts several sensors on one clock"""
+    """stamps of frames: the sender's; those of their arrival; or the sender's moved to the clock of this machine"""
     classes: dict[str, str] = Field(default_factory=dict)
     """names of classes by those of the sender, as `{ Human = "pedestrian" }`; others stay"""
     camera: Path | None = None
@@ -736,8 +734,7 @@ class Settings(BaseSettings):
     zenoh_config: Path | None = None
     """Zenoh configuration file (JSON5): TLS, access control, limits of a router; settings override it"""
     shared_memory: bool = False
-    """Zenoh's shared memory: faster for clouds on one host, but may lose messages, and leaves files in /dev/shm after a
-    kill"""
+    """Zenoh's shared memory: faster for clouds on one host, but may lose messages"""
     profile: str = Field(default="generic", min_length=1)
     """profile name or TOML file, where no pattern matches"""
     profiles: dict[str, str] = Field(default_factory=dict)
@@ -767,8 +764,7 @@ class Settings(BaseSettings):
     jumps: Literal["off", "report"] = "report"
     """report poses that jump within reach of `max_speed`, unless a relocation announces it"""
     queue_frames: int = Field(default=1024, ge=1, le=65536)
-    """frames waiting per stream, as many as a publisher's cache may send at once after an outage; then the oldest is
-    dropped"""
+    """frames waiting per stream; then the oldest is dropped"""
     queue_clouds: int = Field(default=16, ge=1, le=1024)
     """clouds waiting per stream, and as many in its session; then the oldest is dropped"""
     workers: int = Field(default=1, ge=1, le=64)
@@ -778,8 +774,7 @@ class Settings(BaseSettings):
     step_limit_s: float = Field(default=0.5, gt=0, le=60)
     """processor time of a message; a stream that takes more is refused for nine times as long"""
     stream_mb: int = Field(default=128, ge=4, le=65536)
-    """megabytes per stream, a quarter each for waiting messages, clouds, held frames and the window; then the oldest
-    are dropped"""
+    """megabytes of messages per stream; then the oldest are dropped"""
     memory_mb: int = Field(default=1024, ge=16, le=1_048_576)
     """megabytes of messages per process, half of them waiting; then messages are dropped, and the least recently used
     sessions closed"""
@@ -809,15 +804,15 @@ class Settings(BaseSettings):
     cluster_credentials: Path | None = None
     """file with the credentials of a NATS user (`.creds`), `user:password`, or a token"""
     store: str = ""
-    """folder of checkpoints and quarantined sessions; `none`: nothing is kept; default: one named after prefix and
-    endpoint in `$STATE_DIRECTORY`, else in `optipmb` under `$XDG_STATE_HOME` or `~/.local/state`"""
+    """folder of checkpoints and quarantined sessions; `none`: nothing is kept; default: in `$STATE_DIRECTORY`,
+    else in `optipmb` under `$XDG_STATE_HOME` or `~/.local/state`"""
     checkpoint_s: float = Field(default=1.0, ge=0.05, le=3600)
     """time between checkpoints of a changed session"""
     lease_s: float = Field(default=3.0, ge=0.5, le=60)
     """a process that is frozen or cut off for this long loses its streams to the others"""
     standby_s: float = Field(default=10.0, ge=0, le=600)
-    """how long messages of streams that others track are kept for a takeover; longer than `lease_s` and `checkpoint_s`
-    together; with `cluster` also how far back the message log is read without a checkpoint"""
+    """how long messages of streams that others track are kept for a takeover; longer than `lease_s` and
+    `checkpoint_s` together"""
     standby_mb: int = Field(default=256, ge=1, le=65536)
     """megabytes kept so; clouds are dropped first"""
     log_s: float = Field(default=600.0, ge=10, le=864_000)
@@ -831,12 +826,10 @@ class Settings(BaseSettings):
     stale_s: float = Field(default=2.0, gt=0)
     """a stream without frames for this long is logged as stale"""
     stuck_s: float = Field(default=5.0, ge=1, le=600)
-    """a thread busy with one task, or a worker silent, for this long is stuck: the process is not healthy, the worker
-    is replaced"""
+    """a thread busy with one task, or a worker silent, for this long is stuck: not healthy, or replaced"""
     restart_keys: int = Field(default=50_000, ge=100, le=60_000)
-    """keys declared on the network after which a process restarts, its sessions continue from the store: Zenoh has
-    65,535 for the life of a process, and each stream that opens needs up to 5, 2 more with zones, 1
-    more with `outputs`"""
+    """keys declared on the network after which a process restarts and its sessions continue: Zenoh has 65,535 for
+    the life of a process, a new stream needs 5 to 8"""
     grace_s: float = Field(default=1.0, ge=0, le=60)
     """at shutdown, time for frames already received"""
     http: Address = ""
@@ -848,8 +841,8 @@ class Settings(BaseSettings):
     http_origins: Names = ()
     """origins of other pages that may read over HTTP, as `https://map.example`; `*`: any"""
     http_tokens: str = ""
-    """JSON file of names by the SHA-256 of their tokens, or `module:function`, as `grpc_tokens`; default: all may
-    read, and on a loopback address send"""
+    """JSON file of names by the SHA-256 of their tokens, or `module:function`; default: all may read, and on a
+    loopback address send"""
     http_clients: int = Field(default=32, ge=1, le=128)
     """readers of streams over HTTP at once, viewers of the page among them; further ones are refused"""
     http_senders: int = Field(default=64, ge=1, le=256)
@@ -861,8 +854,8 @@ class Settings(BaseSettings):
     grpc: Address = ""
     """address of the gRPC server, as `127.0.0.1:50051`"""
     grpc_tls: Path | None = None
-    """folder with `key.pem`, `cert.pem` and `ca.pem` for gRPC: callers need a certificate of that authority, by whose
-    name they have rights; default: no TLS, all may do everything"""
+    """folder with `key.pem`, `cert.pem` and `ca.pem` for gRPC: callers need a certificate of that authority;
+    default: no TLS, all may do everything"""
     grpc_names: Path | None = None
     """JSON list of the names that may call; default: all with a certificate or token"""
     grpc_tokens: str = Field(default="", pattern=r"^([A-Za-z_][\w.]*:[A-Za-z_]\w*)?$")

@@ -14,55 +14,55 @@ CODES: Final = {
     "missing_field": ("A required field is absent.", "Send the field that `path` names."),
     "invalid_value": ("A field has a wrong value; the whole frame is refused.", "Look at `path`: NaN, sizes, scores?"),
     "unknown_class": (
-        "Objects of a class that the profile lacks are left out; reported once per session.",
+        "Objects of a class that the profile lacks are left out.",
         "Choose another profile, or send the names of its classes.",
     ),
     "score_filter": (
-        "Most detections of a class have scores below the profile's `score_filter`; reported once per session.",
+        "Most scores of a class are below the profile's `score_filter`.",
         "Choose the profile `generic`, or lower the filter of the class.",
     ),
     "velocity": (
-        "Most velocities contradict the motion of their boxes; reported once per session and sensor.",
+        "Most velocities contradict the motion of their boxes.",
         "Send velocities over ground, in m/s, along the axes of the boxes; or none.",
     ),
     "size": (
-        "Most sizes are wider than long, or far from those of their classes; reported once per session and sensor.",
+        "Most sizes are wider than long, or far from those of their classes.",
         "Send length, width, height in metres.",
     ),
     "no_pose": (
-        "The sensor moves, and its frames have no pose: the motion is estimated; reported once per session.",
-        "Send poses where they are known: tracks are in the axes of the sensor without them.",
+        "The sensor moves, and its frames have no pose: the motion is estimated.",
+        "Send poses: without them tracks are in the axes of the sensor.",
     ),
     "embedding": (
-        "Vectors are of another model than `embedding_model` of `rejoin`; reported once per session and sensor.",
-        "Send vectors of that model, or set the one that is sent; until then motion alone joins.",
+        "Vectors are of another model than `embedding_model` of `rejoin`.",
+        "Send vectors of that model, or set the one that is sent.",
     ),
     "far": (
-        "Tracks are far from the origin of their site in `sites`, so their latitudes are wrong; reported once.",
-        "Send metres from that origin, not coordinates of a grid, such as UTM; or correct `origin`.",
+        "Tracks are far from the origin of their site in `sites`: latitudes are wrong.",
+        "Send metres from that origin, not UTM; or correct `origin`.",
     ),
     "no_view": (
-        "A sensor of a fused session with `sensors` has no `field_of_view`: it is taken to see all; reported once.",
-        "Send one: objects that only other sensors see count as missed without it.",
+        "A sensor of a fused session with `sensors` has no `field_of_view`.",
+        "Send one: without it objects that only other sensors see count as missed.",
     ),
     "late": (
         "The frame came later than the window in which tracks are corrected.",
         "Publish in order, or raise `rewind_s`.",
     ),
     "duplicate_epoch": (
-        "A publisher that was replaced by another one still sends; it is tracked again when the other one is silent.",
-        "Stop one of the two publishers: those with the `epoch` of the problem, and with that of the tracks.",
+        "A publisher that was replaced by another one still sends.",
+        "Stop one of the two: the tracks have the `epoch` of the other one.",
     ),
     "duplicate_seq": (
-        "A frame has the epoch and the number of another one, as of a publisher that began again; it is refused.",
-        "Give the publisher a new random epoch at every start, and number its frames upwards.",
+        "A frame has the epoch and the number of another one; it is refused.",
+        "Give the publisher a new random epoch at every start.",
     ),
     "duplicate_key": (
-        "A JSON frame has the key or the stamp of an earlier one and other content; it is refused.",
-        'Send finer stamps, `epoch` and `seq`, or a key for each frame; or set `clock = "arrival"` in `inputs`.',
+        "A JSON frame has the key or the stamp of another one; it is refused.",
+        'Send finer stamps, or `epoch` and `seq`; or set `clock = "arrival"` in `inputs`.',
     ),
     "links": (
-        "`optipmb-service link` leaves something out, which `path` names, or two streams differ by much.",
+        "`optipmb-service link` leaves out what `path` names, or two streams differ by much.",
         "Look at `received`: a wrong clock, a frame of another site, too many streams or tracks.",
     ),
     "shed": ("The queue was full and the oldest frames were dropped.", "Lower the rate, or add processors."),
@@ -79,43 +79,43 @@ CODES: Final = {
         "Check the localisation; if it is right, raise `max_speed`.",
     ),
     "world_jump": (
-        "The pose is not where the sensor was moving. The frame is used, and tracks may end: their world has moved.",
+        "The pose is not where the sensor was moving; tracks may end.",
         "Announce motions of the world as `relocation`. Otherwise check the localisation.",
     ),
     "time_jump": (
-        "The stamp is over `gap_limit_s` ahead or `rewind_s` behind; frames are refused until three in a row agree.",
+        "The stamp is over `gap_limit_s` ahead or `rewind_s` behind; refused until three frames agree.",
         "Check the sensor's clock.",
     ),
     "clock": (
-        "Stamps do not advance, or not in nanoseconds, or, with `outputs`, are not system time; frames are tracked.",
-        "Send the time of the measurement, in nanoseconds, as `stamp_ns`; in `outputs`, see `clock`.",
+        "Stamps do not advance, or not in nanoseconds, or, with `outputs`, are not system time.",
+        "Send the time of the measurement in nanoseconds; in `outputs`, see `clock`.",
     ),
     "restarted": (
-        "The session restarted: its tracks ended (`clock`: objects found again keep ids). `received` has the reason.",
-        "After `jump`, `clock` or `pose`: check clock and localisation. After `publisher` (a restart): nothing.",
+        "The session restarted, and its tracks ended; `received` has the reason.",
+        "After `jump`, `clock` or `pose`: check clock and localisation.",
     ),
     "overload": (
-        "The frame, or the stream, exceeds its limit of computing time; the frame is refused.",
+        "The frame, or the stream, takes too much computing time; it is refused.",
         "Suppress overlapping boxes in the detector, send less, or raise `max_pairs`, `step_limit_s`.",
     ),
     "superseded": (
-        "The instance was frozen or cut off for longer than its lease; another one tracks the stream now.",
-        "Nothing. If it happens often, raise `lease_s`, or look for what stops the process.",
+        "The instance was frozen or cut off; another one tracks the stream now.",
+        "If it happens often, raise `lease_s`, or look for what stops the process.",
     ),
     "certificate": (
         "A certificate of the service has ended, or does not fit its key; `received` names it.",
         "Renew it; see `security.md`. A process that listens with it needs a restart.",
     ),
     "contested": (
-        "Two instances without the same `store` track the stream; reported until one is left.",
+        "Two instances without the same `store` track the stream.",
         "Give them one `store` or `cluster`, or routers of their own.",
     ),
     "duplicate_name": (
-        "Another process answers by the name of this instance. Both track, but orders and status reach either.",
+        "Another process answers by the name of this instance.",
         "Give each its own `instance`, or none: the default is unique.",
     ),
     "numbers_back": (
-        "A publisher began again with the Zenoh id of its last run: Zenoh drops as many messages as that had sent.",
+        "A publisher began again with the Zenoh id of its last run: Zenoh drops its messages.",
         "Remove `id` from its Zenoh configuration, and start it again.",
     ),
     "cut": (
@@ -124,11 +124,11 @@ CODES: Final = {
     ),
     "message_log": (
         "A message is not in the message log: NATS was away for too long, or does not take it.",
-        "Nothing for the tracks. See the NATS servers; a successor has to get the frame from the publisher's cache.",
+        "See the NATS servers; the tracks are not affected.",
     ),
     "internal": (
-        "A bug in the service. If a tracking step failed, the session is quarantined and its last frames are saved.",
-        "Report it, with the saved file if there is one; `optipmb track --dump` replays it.",
+        "A bug in the service. After a failed step the last frames are saved.",
+        "Report it, with the saved file, which `optipmb track --dump` replays.",
     ),
     "quarantined": (
         "Tracking this stream failed, see `internal`; its frames are refused.",

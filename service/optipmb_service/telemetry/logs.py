@@ -23,77 +23,83 @@ if TYPE_CHECKING:
     from structlog.typing import EventDict, Processor, WrappedLogger
 
 EVENTS: Final = {
-    "log_lines_dropped": "Whoever reads stderr reads too slowly, or not at all: `count` lines were not written.",
+    "log_lines_dropped": "Nobody read stderr in time: `count` lines were not written.",
     "starting": "The service compiles or loads its kernels.",
     "connecting": "Waits for a router. If this lasts, check `connect`.",
     "http": "Health, metrics and the live page are served at `address`.",
     "ready": "Streams and queries are served.",
-    "keys_used_up": "The process has declared `restart_keys` keys: it ends in order, and begins again in its place.",
+    "keys_used_up": "The process has declared `restart_keys` keys, and restarts.",
     "grpc": "gRPC is served at `address`.",
     "grpc_call": "A call has ended (level debug).",
     "grpc_connections": "The limit of open files allows fewer connections than the setting.",
     "grpc_invalid": "An invalid message from the network was not forwarded to callers.",
-    "edge_invalid": "An invalid message from the network was left out over HTTP or MQTT, or in a list of streams.",
+    "edge_invalid": "An invalid message from the network was left out over HTTP or MQTT.",
     "http_certificates": "Changed files of `http_tls` cannot be used; the certificate before holds.",
     "grpc_certificates": "Renewed certificates cannot be read; the previous ones stay in use.",
-    "certificate_ends": "Certificates that end within a week, and the `days` that they hold: renew them.",
-    "certificate_unusable": "A certificate, renewed perhaps, does not fit its key: the one before is served until both"
-    " files fit. The state is `degraded`.",
-    "certificate_ended": "A certificate has ended: no link with it can be opened. Renew it, and restart what listens"
-    " with it.",
+    "certificate_ends": "Certificates that end within a week, in `days`: renew them.",
+    "certificate_unusable": "A certificate does not fit its key: the one before is served. The state is `degraded`.",
+    "certificate_ended": "A certificate has ended. Renew it, and restart what listens with it.",
     "tokens_unusable": "The file of tokens has changed and cannot be used: the tokens before hold.",
-    "unprotected": "Everybody who reaches these `addresses` may publish, read and command: there is neither TLS nor"
-    " access control. Of `http`: all may read without `http_tokens`, and tokens are readable without `http_tls`. See"
-    " `security.md`.",
+    "unprotected": (
+        "Everybody who reaches these `addresses` may publish, read and command. Of `http`: all may read without "
+        "`http_tokens`, and tokens are readable without `http_tls`. See `security.md`."
+    ),
     "unknown_environment": "Variables `OPTIPMB_…` that are not settings, usually misspelt.",
     "peer_connected": "A node, router or service has connected.",
     "tracker_message": "A `text` of the tracker: it compiles, for up to a minute.",
-    "leases_gone": "The store has lost its records, as by a purge in NATS; the member writes its own again.",
-    "store_deleted": "A `file` of the store was deleted while in use, and was made again with all that it held.",
+    "leases_gone": "The store has lost its records; the member writes its own again.",
+    "store_deleted": "A `file` of the store was deleted while in use, and was made again.",
     "peer_lost": "A connection is lost. A client reconnects and recovers what the caches hold.",
-    "sessions_stored": "The `folder` has so many `sessions` of earlier runs: their streams continue, with their ids.",
+    "sessions_stored": "The `folder` has so many `sessions` of earlier runs, which continue.",
     "session_opened": "A stream's first valid message came, or parameters were set for it.",
     "session_restored": "A session continues from its checkpoint; missed frames are requested from publishers.",
-    "profile_differs": "A session continues with the `profile` of its checkpoint, and the settings name `configured`,"
-    " or have other values for it. `optipmb set STREAM --profile NAME --restart` changes it.",
-    "session_begun": "A density began: `first` frame, `publisher` restarted with a jump, a `jump` of stamps, `reset`, "
-    "`parameters`, an implausible `pose`, too much `effort`, the end of a `quarantine`. Repeated jumps: check"
-    " the sensor's clock.",
+    "profile_differs": (
+        "A session continues with the `profile` of its checkpoint, and the settings name `configured`. `optipmb set "
+        "STREAM --profile NAME --restart` changes it."
+    ),
+    "session_begun": (
+        "A density began: `first` frame, restart of the `publisher`, `jump` of stamps, `reset`, `parameters`, "
+        "implausible `pose`, too much `effort`, end of a `quarantine`."
+    ),
     "session_quarantined": "Tracking a stream raised `error`. Its last frames are saved; see the problem `internal`.",
     "stream_degraded": "A message took `took_s` of processor time; its stream is refused for `refused_s`.",
-    "session_closed": "A session was freed: `idle` for long, by a `query`, `moved` elsewhere, lacking `memory`,"
-    " `evicted` for a stream of another site, or `superseded` by another instance.",
-    "checkpoint_torn": "A checkpoint cannot be read, for `reason`: it is set aside, the one before it is used."
-    " Where `reason` names another format, start the release that wrote it; without it the ids go on all the same.",
+    "session_closed": (
+        "A session was freed: `idle`, by a `query`, `moved`, lacking `memory`, `evicted` for another site, or "
+        "`superseded` by another instance."
+    ),
+    "checkpoint_torn": (
+        "A checkpoint cannot be read, for `reason`: the one before it is used. Where `reason` names another format, "
+        "start the release that wrote it."
+    ),
     "checkpoint_refused": "A checkpoint was not written: another instance has taken the stream over.",
     "checkpoints_expired": "Checkpoints older than `keep_days` were deleted; their ids are kept.",
-    "checkpoint_failed": "The checkpoint of one stream cannot be made: a bug, report it."
-    " The stream continues, other checkpoints are written; the state is `degraded`.",
+    "checkpoint_failed": (
+        "The checkpoint of one stream cannot be made: a bug, report it. The stream continues; the state is `degraded`."
+    ),
     "store_failed": "Checkpoints cannot be written (disk full, read-only): tracking goes on, the state is `degraded`.",
     "store_back": "Checkpoints are written again.",
     "partitions_held": "Number of partitions that this member holds, and the `members`.",
-    "leases_damaged": "The `file` of the leases was damaged, as by a power cut, and made anew: nobody used it.",
-    "lease_lost": "This member was frozen, starved or cut off for `lease_s`, and others continue its streams. It joins"
-    " again at once.",
+    "leases_damaged": "The `file` of the leases was damaged, as by a power cut, and made anew.",
+    "lease_lost": "This member was frozen or cut off for `lease_s`, and others continue its streams. It joins again.",
     "leases_failed": "The servers of `cluster`, or the folder `store`, cannot be used, for `error`: after half of"
     " `lease_s` nothing is published, and the state is `paused`.",
     "leases_back": "They can be used again.",
-    "leases_slow": "Each renewal of the lease has taken more than a quarter of `lease_s`, the last one `took_s`: new"
-    " streams begin late. Look for a slow disk or network, or raise `lease_s`.",
+    "leases_slow": (
+        "Renewals of the lease take more than a quarter of `lease_s`: look for a slow disk or network, or raise "
+        "`lease_s`."
+    ),
     "leases_in_time": "A renewal of the lease was in time again.",
     "links_torn": "The state of the links of `area` cannot be read: it is set aside, and the one before is taken.",
     "links_not_saved": "The state of the links cannot be written, for `error`: a restart goes back to the last one.",
     "links_taken": "Another process links the streams of `area` now: this one does nothing there any more.",
-    "message_log_failed": "The message log cannot be written, for `error`: the bridge holds 256 MB of messages and"
-    " tries again.",
+    "message_log_failed": "The message log cannot be written, for `error`; the bridge tries again.",
     "message_log_back": "The message log can be written.",
     "message_log_unread": "The message log could not be read for the session of `streams`: frames may be missing.",
-    "message_log_cut": "A session missed more of the message log than it takes at once: the oldest frames are left"
-    " out.",
+    "message_log_cut": "A session missed more of the message log than it takes: the oldest frames are left out.",
     "traces_lost": "The collector does not answer, or refuses: `spans` are lost, until `traces_back`.",
     "traces_back": "The collector takes spans again.",
     "traceparent_invalid": "A publisher sends the invalid trace context `received`: its frames begin new traces.",
-    "traces_failed": "A `text` of OpenTelemetry: spans could not be sent, or there were too many; some are lost.",
+    "traces_failed": "A `text` of OpenTelemetry: some spans are lost.",
     "stream_stale": "No frame for `stale_s`: check the publisher.",
     "stream_back": "Frames arrive again.",
     "problem": "`count` messages were refused or lost since the last line: see the table of problems.",
@@ -110,25 +116,26 @@ EVENTS: Final = {
     "query": "A query was answered (level debug).",
     "internal_error": "A bug, with its traceback: report it. The stream continues.",
     "worker_started": "The parent has started a worker.",
-    "worker_not_started": "The system refuses to start a worker, for this reason. At the start the service ends with"
-    " status 1, later it tries again after `again_s` of `worker_ended`.",
-    "worker_ended": "A worker has ended by itself, with this status (below 0: by this signal). It is restarted"
-    " after `again_s`; until then the state is `degraded`.",
-    "worker_restarts": "A worker has declared `restart_keys` keys and ended in order; it is started again at once.",
+    "worker_not_started": (
+        "The system refuses to start a worker. At the start the service ends with status 1, later it tries again."
+    ),
+    "worker_ended": (
+        "A worker has ended by itself, with this status (below 0: signal). It is restarted after `again_s`."
+    ),
+    "worker_restarts": "A worker has declared `restart_keys` keys and restarts.",
     "worker_stuck": "A worker has not responded for `silent_s`; it is killed and restarted.",
     "worker_killed": "A worker did not end or respond in time and was killed.",
     "metrics_unreadable": "The metrics of a worker cannot be read and are left out.",
     "parent_gone": "The parent has died; its worker ends.",
-    "stop_asked": "SIGINT, SIGTERM, SIGHUP, SIGUSR1 or SIGUSR2, or the parent ends its worker;"
-    " it stops within 8 s + `grace_s`, a parent of workers within 10 s + `grace_s`.",
+    "stop_asked": (
+        "A signal ends the service, or the parent its worker, within 8 s + `grace_s`, a parent of workers within 10 s "
+        "+ `grace_s`."
+    ),
     "stop_asked_again": "Another signal, which has no effect.",
-    "step_hangs": "`steps` of the end do not return, as in Zenoh; checkpoints are written all the same, unless"
-    " `store_failed` says otherwise. The exit status is 1.",
-    "end_hangs": "The end took too long, and the process was ended with status 1. `threads` is where each thread was,"
-    " the innermost call first.",
+    "step_hangs": "`steps` of the end do not return; checkpoints are written all the same. The exit status is 1.",
+    "end_hangs": "The end took too long, and the process was ended with status 1. `threads` is where each thread was.",
     "end_unbounded": "No thread can be started (a limit of processes or memory): the end may take any time.",
-    "stopped": "The service has stopped; `drained` is false when a step was abandoned, or not all checkpoints"
-    " are written.",
+    "stopped": "The service has stopped; `drained` is false when not all is done.",
 }
 """Every event that is logged, and what an operator makes of it."""
 
