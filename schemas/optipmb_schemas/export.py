@@ -21,7 +21,7 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
 from optipmb_schemas import json_form
 from optipmb_schemas.codec import MAJOR, MESSAGES, encoding_of
-from optipmb_schemas.control import MemberSummary, SessionState, SessionSummary
+from optipmb_schemas.control import MemberSummary, SessionParameters, SessionState, SessionSummary
 from optipmb_schemas.limits import DEFAULT
 from optipmb_schemas.messages import (
     Attribute,
@@ -29,6 +29,7 @@ from optipmb_schemas.messages import (
     Detections,
     FieldOfView,
     LinkedObject,
+    Points,
     Pose,
     Relocation,
     Tracks,
@@ -55,6 +56,8 @@ _KINDS: Final[tuple[type[Message], ...]] = (
     SessionSummary,
 )
 _KIND: Final = {kind.__name__: kind for kind in _KINDS}
+_SENT: Final = (Detections, Points, Pose, Relocation, FieldOfView, SessionParameters)
+"""What others send: its tables have the ranges of arrays."""
 
 
 class _Untitled(GenerateJsonSchema):
@@ -125,8 +128,8 @@ def _default(info: FieldInfo) -> str:
 def _type(kind: type[Message], name: str, schema: JsonSchemaValue) -> str:
     if name in kind.arrays:
         array = kind.arrays[name]
-        values = array.range_described.removeprefix("a number ").removeprefix("an integer ")
-        return f"{array.dtype} {array.shape_described}, {values}"
+        values = array.range_described.removeprefix("a number ").removeprefix("an integer ") if kind in _SENT else ""
+        return f"{array.dtype} {array.shape_described}" + (f", {values}" if values else "")
     alternatives = [part for part in schema.get("anyOf", [schema]) if part.get("type") != "null"]
     return _scalar(alternatives[0])
 
