@@ -54,6 +54,7 @@ from optipmb_tools.tuning.scoring import plain_figures, rules_of, scorer_of
 
 import optipmb
 from optipmb.learning.hindsight import with_hindsight
+from optipmb.learning.sensor_motion import UNKNOWN_MOTION
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -224,10 +225,12 @@ def track(clip: Clip, parameters: Parameters, *, posed: bool, hindsight: float) 
     """Return the tracks of all classes in the world frame, and which are confirmed, with some seconds of hindsight."""
     tracker = optipmb.Tracker(parameters)
     found: dict[int, Tracks] = {}
-    density = tracker.initial()
-    for index, frame in enumerate(clip.frames):
-        result = tracker.step(density, frame)
-        density, found[index] = result.density, result.tracks
+    density, index, tried = tracker.initial(), 0, False
+    while index < len(clip.frames):
+        result = tracker.step(density, clip.frames[index])
+        density, found[index], index = result.density, result.tracks, index + 1
+        if hindsight and density.on_vehicle and not tried:  # as `optipmb track` begins anew
+            density, index, tried = replace(tracker.initial(), sensor=UNKNOWN_MOTION), 0, True
     if hindsight:
         changed = with_hindsight(list(found.values()), parameters, velocity_s=hindsight if posed else 0.0)
         found = {index: found[index].replaced(**columns) for index, columns in zip(found, changed, strict=True)}

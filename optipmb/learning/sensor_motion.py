@@ -21,6 +21,10 @@ without the strongest object, so that one wrong box shows nothing, and less what
 The motion is used when the sum over frames is enough, after a time that is long enough (`Density.sensor_motion`). Of
 traffic, and of rows of parked cars along the way, there is no evidence. Once the sensor is known to move, objects that
 drive are predicted before they are compared.
+
+A motion that is not found again is carried on for `CARRIED_S`, and looked for in a range that grows with that time. A
+sensor that moved for two seconds is on a vehicle (`Density.on_vehicle`): after a stop, its next motion needs no
+evidence. Recordings are tracked from their first frame on with that knowledge (`UNKNOWN_MOTION`).
 """
 
 from __future__ import annotations
@@ -33,7 +37,7 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.filter.predict import heading_unknown
-from optipmb.model.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, OMEGA, PHI, V, X, Y, objects_in
+from optipmb.model.density import ENOUGH, LEAST_MOVED_S, NO_FRAME, OMEGA, PHI, PROVEN, V, X, Y, objects_in
 from optipmb.model.relocation import Relocation
 from optipmb.model.rows import read_only
 
@@ -103,6 +107,12 @@ STANDING: Final = (0.3, 0.01)
 """Speed, m/s, and turn rate, rad/s, below which a sensor may be taken to stand again."""
 
 
+CARRIED_S: Final = 1.5
+"""Time for which a motion is carried on that is not found again, s."""
+STOPPED: Final = 0.6
+"""Share of the objects that are in their places, from which a sensor without a motion has stopped."""
+UNKNOWN_MOTION: Final = read_only(np.array([0.0, 0.0, 0.0, PROVEN, LEAST_MOVED_S]))
+"""`Density.sensor` of a sensor that is known to be on a vehicle, before its motion is found."""
 LEAST_EVIDENCE: Final = 0.1
 """Evidence of a motion that is not found again which counts as none: the estimate ends."""
 ROUNDING: Final = 1e-6
@@ -174,7 +184,7 @@ def next_motion(
     Returns:
         `STAYS`, `MOVES` or `BEGINS`; the motion t and theta (3,), zero where the density stays; and the next `sensor`.
     """
-    objects, none = objects_in(object_words), np.zeros(0)
+    objects = objects_in(object_words)
     distance = np.full(objects.label.shape[0], math.inf)
     for n in range(objects.label.shape[0]):
         sure = objects.seen_ns[n] == before_ns and objects.existence[n] >= SURE
@@ -196,26 +206,39 @@ def next_motion(
     for k in range(order.shape[0]):
         d = best[order[k]]
         target[k, 0], target[k, 1], target_label[k] = center[d, 0], center[d, 1], label[d]
-    pairs, stays, guess = Pairs(start, start_label, target, target_label), np.zeros(3), np.zeros(3)
-    used = in_use(sensor)
-    if used:
-        for s in range(3):
-            guess[s] = sensor[s] * dt
-        found = continued(pairs, driven(objects, rows, dt), guess, dt)
-        if found.shape[0]:
-            still = math.hypot(found[0], found[1]) < STANDING[0] * dt and abs(found[2]) < STANDING[1] * dt
-            return (STAYS, stays, none) if still else (MOVES, found, moving(found, dt))
-    found, after = begun(pairs, dt), none
+    pairs = Pairs(start, start_label, target, target_label)
+    if in_use(sensor) and sensor[:EVIDENCE].any():
+        return kept_on(sensor, pairs, driven(objects, rows, dt), dt)
+    stays, found = np.zeros(3), begun(pairs, dt)
+    if found.shape[0] and in_use(sensor):
+        return MOVES, found, moving(found, dt, sensor[EVIDENCE], 0.0)
     if found.shape[0]:
-        after = weighed(none if used else sensor, pairs, objects, rows, found, dt, classes)
-        if in_use(after):
-            return MOVES if used else BEGINS, found, moving(found, dt)
-    elif sensor.shape[0] and not used and sensor[EVIDENCE] * KEPT ** (10.0 * dt) > LEAST_EVIDENCE:
-        after = sensor.copy()
+        after = weighed(sensor, pairs, objects, rows, found, dt, classes)
+        return (BEGINS, found, moving(found, dt, ENOUGH, 0.0)) if in_use(after) else (STAYS, stays, after)
+    after = sensor.copy()
+    if sensor.shape[0] and not in_use(sensor):
         after[EVIDENCE] *= KEPT ** (10.0 * dt)
-    if used and together(pairs, stays).sum() < SHARE * rows.shape[0]:
-        return MOVES, guess, moving(guess, dt)  # neither continued nor stopped: left to the next frame
+        after = after[: 0 if after[EVIDENCE] <= LEAST_EVIDENCE else after.shape[0]].copy()
     return STAYS, stays, after
+
+
+@kernel
+def kept_on(sensor: Array, pairs: Pairs, ahead: Array, dt: float) -> tuple[int, Array, Array]:
+    """Return as `next_motion` does how a sensor that moves goes on.
+
+    Arguments of its own:
+        sensor: (5,) `Density.sensor`.
+        ahead: (N, 2) where the objects are after dt, over ground.
+    """
+    guess, stays = sensor[:EVIDENCE] * dt, np.zeros(3)
+    evidence, lost = sensor[EVIDENCE], sensor[SECONDS] - LEAST_MOVED_S
+    found = continued(pairs, ahead, guess, dt, lost)
+    if found.shape[0]:
+        if math.hypot(found[0], found[1]) >= STANDING[0] * dt or abs(found[2]) >= STANDING[1] * dt:
+            return MOVES, found, moving(found, dt, min(evidence + dt, PROVEN), 0.0)
+    elif lost < CARRIED_S and together(pairs, stays).sum() < STOPPED * pairs.start.shape[0]:
+        return MOVES, guess, moving(guess, dt, evidence, lost + dt)
+    return STAYS, stays, moving(stays, dt, evidence, 0.0) if evidence >= PROVEN else np.zeros(0)
 
 
 @kernel
@@ -225,9 +248,9 @@ def in_use(sensor: Array) -> bool:
 
 
 @kernel
-def moving(motion: Array, dt: float) -> Array:
-    """Return `Density.sensor` of a sensor that made a motion."""
-    return np.array([motion[0] / dt, motion[1] / dt, motion[2] / dt, ENOUGH, LEAST_MOVED_S])
+def moving(motion: Array, dt: float, evidence: float, lost: float) -> Array:
+    """Return `Density.sensor` of a sensor that made a motion, which was found so many seconds ago."""
+    return np.array([motion[0] / dt, motion[1] / dt, motion[2] / dt, evidence, LEAST_MOVED_S + lost])
 
 
 @kernel
@@ -261,9 +284,13 @@ def driven(objects: Bernoullis, rows: Index, dt: float) -> Array:
 
 
 @kernel
-def continued(pairs: Pairs, start: Array, guess: Array, dt: float) -> Array:
-    """Return the motion near the guess, the guess itself where there are few objects; (0,) without any."""
-    reach, turn, trust = 1.0 + CHANGE[0] * dt * dt, 0.02 + CHANGE[1] * dt * dt, (0.15 / (0.05 + dt * dt)) ** 2
+def continued(pairs: Pairs, start: Array, guess: Array, dt: float, lost: float) -> Array:
+    """Return the motion near the guess, the guess itself where there are few objects; (0,) without any.
+
+    `lost` is the time for which it was not found, s.
+    """
+    reach, turn = 1.0 + CHANGE[0] * dt * (dt + lost), 0.02 + CHANGE[1] * dt * (dt + lost)
+    trust = (0.15 / (0.05 + dt * (dt + lost))) ** 2
     ahead = Pairs(start, pairs.label, pairs.target, pairs.target_label)
     found, count, _ = common_motion(ahead, guess, reach, turn, trust)
     if count >= max(CREW // 2, 0.5 * SHARE * start.shape[0]):

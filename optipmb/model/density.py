@@ -190,6 +190,8 @@ ENOUGH: Final = 3.0
 """Evidence for a motion of the sensor from which it is used, and"""
 LEAST_MOVED_S: Final = 0.25
 """the time over which it has to be found before, s."""
+PROVEN: Final = ENOUGH + 2.0
+"""Evidence, with a unit for each second of motion, from which a sensor is known to be on a vehicle."""
 
 
 @record
@@ -247,7 +249,7 @@ class Density:
         self_calibration: counts of scores; None where the profile does not calibrate them itself.
         sensor: (5,) velocity, m/s, and turn rate, rad/s, with which what stands passes a sensor without poses, the
             evidence that it moves so, and the time over which that was found, s (`optipmb.learning.sensor_motion`);
-            None where it stands or frames have poses.
+            None where it is not known to be on a vehicle or frames have poses.
         rejoining: lost objects and what else joining needs; None where tracks are not joined.
         attributes: texts of the objects, also of lost ones; None where no detection has brought any.
     """
@@ -271,6 +273,11 @@ class Density:
         if sensor is None or sensor[3] < ENOUGH or sensor[4] < LEAST_MOVED_S:
             return None
         return sensor[:3]
+
+    @property
+    def on_vehicle(self) -> bool:
+        """Tell whether the sensor moved for so long, without poses, that it is known to be on a vehicle."""
+        return self.sensor is not None and bool(self.sensor[3] >= PROVEN)
 
     @property
     def missed_from_ns(self) -> Index:

@@ -166,15 +166,44 @@ def test_pedestrians_that_walk_together_are_not_its_motion() -> None:
         assert (density.sensor_motion is not None) == moves
 
 
-def test_a_sensor_that_stops_stands() -> None:
-    """The estimate ends where the sensor does."""
+def test_a_sensor_that_stops_soon_stands() -> None:
+    """The estimate ends where the sensor does, which moved for less than two seconds."""
+    moving = street(15.0, 10.0)[:15]
+    t, boxes, cars = moving[-1]
+    rng = np.random.default_rng(1)
+    still = [(t + 0.1 * k, boxes + rng.normal(0.0, [0.1, 0.1, 0.0], boxes.shape), cars) for k in range(1, 30)]
+    found, _ = tracked(GENERIC, moving + still)
+    assert found[len(moving) - 1].sensor_motion is not None
+    assert found[-1].sensor_motion is None
+
+
+def test_a_vehicle_that_stopped_is_known_to_move_again_at_once() -> None:
+    """After six seconds of driving a stop does not end the estimate, and the next motion needs no evidence."""
     moving = street(5.0, 10.0)
     t, boxes, cars = moving[-1]
     rng = np.random.default_rng(1)
     still = [(t + 0.1 * k, boxes + rng.normal(0.0, [0.1, 0.1, 0.0], boxes.shape), cars) for k in range(1, 15)]
-    found, _ = tracked(GENERIC, moving + still)
-    assert found[len(moving) - 1].sensor_motion is not None
-    assert found[-1].sensor_motion is None
+    on = [(t + 1.4 + 0.1 * k, boxes - [0.5 * k, 0.0, 0.0], cars) for k in range(1, 5)]
+    found, _ = tracked(GENERIC, moving + still + on)
+    stood, drives = (one.sensor_motion for one in (found[len(moving) + 13], found[-1]))
+    assert stood is not None
+    assert drives is not None
+    np.testing.assert_allclose(stood, 0.0, atol=0.3)
+    np.testing.assert_allclose(drives[:2], [-5.0, 0.0], atol=1.0)
+
+
+@pytest.mark.parametrize("missing", [3, 40], ids=["carried_on", "ended"])
+def test_a_motion_is_carried_on_over_frames_that_do_not_show_it(missing: int) -> None:
+    """Boxes elsewhere, in three frames: the motion of before. In forty: a vehicle that is taken to stand."""
+    moving = street(10.0, 10.0)
+    rng = np.random.default_rng(2)
+    others = [
+        (moving[-1][0] + 0.1 * k, np.column_stack((rng.uniform(-40.0, 40.0, (20, 2)), np.zeros(20))), np.zeros(20, int))
+        for k in range(1, missing + 1)
+    ]
+    motion = tracked(GENERIC, moving + others)[0][-1].sensor_motion
+    assert motion is not None
+    np.testing.assert_allclose(motion[:2], [-10.0 if missing == 3 else 0.0, 0.0], atol=2.0)
 
 
 def test_evidence_that_nothing_adds_to_ends() -> None:

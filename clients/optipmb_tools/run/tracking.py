@@ -1,6 +1,7 @@
 """Offline tracking: one sequence in this process, or the recordings of a data set, one task each.
 
-A replay through the service (`optipmb_tools.run.replay`) gives the same bytes.
+A replay through the service (`optipmb_tools.run.replay`) gives the same bytes, but where the motion of a sensor without
+poses is estimated: only recordings can begin anew when later frames show that it is on a vehicle.
 """
 
 import functools
@@ -37,6 +38,7 @@ from optipmb import (
 )
 from optipmb.learning.hindsight import with_hindsight
 from optipmb.learning.self_calibration import learned_noise
+from optipmb.learning.sensor_motion import UNKNOWN_MOTION
 from optipmb.learning.velocity_check import EXPECTED, VelocityCheck
 from optipmb.model.parameters import ALIKE
 from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame, selected_frames
@@ -117,10 +119,12 @@ def track_whole(
     sensors: Sensors = ALIKE,
     smooth: bool = False,
     on_frame: Callable[[], None] = lambda: None,
+    sensor: NDArray[np.float64] | None = None,
 ) -> Tracked:
     """Track one sequence, with `smooth` so that states are given all frames of their track.
 
-    Frames that name their sensor are used as `sensors` say.
+    Frames that name their sensor are used as `sensors` say. Once frames without poses show that the sensor is on a
+    vehicle, the sequence is tracked anew with that knowledge: with `sensor` as `Density.sensor` before the first frame.
 
     Raises:
         UsageError: A frame holds values that the tracker refuses.
@@ -143,7 +147,7 @@ def track_whole(
     # A smoother joins the frames of a track, which an estimated motion has in axes of their own.
     followed = parameters.model_copy(update={"sensor_motion": False}) if smooth else parameters
     used = _trackers(followed, modules, sensors)
-    density = Density.empty(parameters.labels)
+    density = replace(Density.empty(parameters.labels), sensor=sensor)
     for frame in selected_frames(sequence, classes):
         own, tracker, least = used(frame.sensor)
         taken = tracker_frame(own, sequence.name, frame)
@@ -151,6 +155,11 @@ def track_whole(
         result = tracker.step(density, taken)
         steps.append(time.perf_counter_ns() - started)
         density = result.density
+        if density.on_vehicle and sensor is None:
+            left = _from_call(len(found), on_frame)
+            return track_whole(
+                parameters, sequence, classes, modules, sensors=sensors, on_frame=left, sensor=UNKNOWN_MOTION
+            )
         found[frame.index] = _message(parameters, sequence, frame, result)
         if smoother is not None:
             smoother.add(frame.index, density, result.tracks)
@@ -164,10 +173,7 @@ def track_whole(
         if not parameters.self_calibration:  # which never filters the upper half of a class
             low += np.bincount(taken.label[taken.score < least[taken.label]], minlength=size)
         on_frame()
-    for name, count, total in zip(parameters.labels, low.tolist(), given.tolist(), strict=True):
-        if count:
-            most = ", most of the class" if count > total / 2 else ""
-            left_out[f"{name} below its score_filter{most}"] = count
+    left_out.update(_below_filters(parameters.labels, low, given))
     if smoother is not None:
         for index, one in smoother.tracks():
             paths = predict_tracks(one, parameters.horizons, parameters) if parameters.horizons else None
@@ -175,6 +181,26 @@ def track_whole(
     counts = clouds, detections, dict(left_out), estimated
     doubts = tuple(one.contradiction for one in checks.values() if one.contradiction)
     return Tracked(found, *counts, learned_noise(density), doubts, tuple(steps), time.monotonic() - begun)
+
+
+def _from_call(number: int, called: Callable[[], None]) -> Callable[[], None]:
+    """Return a function that leaves out so many calls of another."""
+    calls = itertools.count()
+
+    def call() -> None:
+        if next(calls) >= number:
+            called()
+
+    return call
+
+
+def _below_filters(labels: Sequence[str], low: NDArray[np.int64], given: NDArray[np.int64]) -> dict[str, int]:
+    """Return how many detections of each class are below its filter, in words."""
+    return {
+        f"{name} below its score_filter{', most of the class' if count > total / 2 else ''}": count
+        for name, count, total in zip(labels, low.tolist(), given.tolist(), strict=True)
+        if count
+    }
 
 
 def fields_of(tracks: optipmb.Tracks, paths: PredictedPaths | None, **others: Any) -> dict[str, Any]:
