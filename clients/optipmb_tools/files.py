@@ -175,14 +175,15 @@ def _number(path: Path, line: int, field: str) -> float:
         raise DatasetError(path, "a number", repr(field), line=line) from error
 
 
-def write_whole(path: Path, content: bytes | memoryview | Iterable[str]) -> None:
-    """Write a file of bytes, or of texts one after the other; it appears under its name complete, or not at all."""
+def write_whole(path: Path, content: bytes | memoryview | Iterable[str | bytes]) -> None:
+    """Write a file of bytes, or of parts one after the other; it appears under its name complete, or not at all."""
     path.parent.mkdir(parents=True, exist_ok=True)
     descriptor, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     temporary = Path(name)
     try:
         with os.fdopen(descriptor, "wb") as file:
-            file.writelines([content] if isinstance(content, bytes | memoryview) else map(str.encode, content))
+            parts = [content] if isinstance(content, bytes | memoryview) else content
+            file.writelines(part.encode() if isinstance(part, str) else part for part in parts)
             file.flush()
             os.fsync(file.fileno())
         # A temporary file is private to its owner; the finished one is to be as readable as any other new file.

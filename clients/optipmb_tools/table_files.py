@@ -60,6 +60,7 @@ _MOST_PARTS: Final = 16
 _EXACT: Final = 2**53  # integers up to it are exact as 64-bit numbers with a point
 _INT64: Final = 2**63
 _BLOCK: Final = 1 << 20  # characters of a text that are read at once
+_ROWS: Final = 1 << 16  # of a text that are written at once
 _PART: Final = 1 << 20  # texts that are compared at once: an array of pyarrow holds 2 GB of them
 _LONGEST_LINE: Final = 1 << 25  # bytes of a line of JSON that pyarrow reads; longer ones are read one by one
 _OWN: Final = {".parquet": (b"par1",), ".feather": (b"arrow1", b"feather"), ".arrow": (b"arrow1", b"feather")}
@@ -640,22 +641,13 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     kind = path.suffix.lower()
     if kind in {".jsonl", ".ndjson"}:  # dates as text
         columns = {name: one.astype(np.str_) if one.dtype.kind == "M" else one for name, one in columns.items()}
-    table = to_arrow(columns)
     path.parent.mkdir(parents=True, exist_ok=True)
-    content: Any = io.BytesIO()
     if kind in {".csv", ".tsv"}:
-        from pyarrow import csv  # noqa: PLC0415  packages of an extra
-
-        separator = "\t" if kind == ".tsv" else ","
-        texts = [name for name, values in columns.items() if values.dtype.kind == "U"]
-        special = any(
-            mark in text for name in texts for text in np.unique(columns[name]) for mark in (separator, '"', "\n")
-        )
-        style = "needed" if special else "none"  # "needed" quotes every text
-        head = [f'"{name}"' for name in columns] if special else columns  # releases of pyarrow differ in it
-        content.write((separator.join(head) + "\n").encode())
-        csv.write_csv(table, content, csv.WriteOptions(include_header=False, delimiter=separator, quoting_style=style))
-    elif kind in {".jsonl", ".ndjson"}:
+        write_whole(path, _csv_parts(columns, "\t" if kind == ".tsv" else ","))
+        return
+    table = to_arrow(columns)
+    content: Any = io.BytesIO()
+    if kind in {".jsonl", ".ndjson"}:
         content.write("".join(json.dumps(row) + "\n" for row in table.to_pylist()).encode())
     elif kind == ".parquet":
         from pyarrow import parquet  # noqa: PLC0415  as above
@@ -668,6 +660,24 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     else:
         raise DatasetError(path, f"a table ({', '.join(SUFFIXES)})", f"a file named *{kind}")
     write_whole(path, content.getbuffer())
+
+
+def _csv_parts(columns: Mapping[str, NDArray[Any]], separator: str) -> Iterator[str | bytes]:
+    """Yield the line of names, and the rows in parts: the text of a long table is never in memory as a whole."""
+    _pyarrow()
+    from pyarrow import csv  # noqa: PLC0415  packages of an extra
+
+    texts = [values for values in columns.values() if values.dtype.kind == "U"]
+    special = any(mark in text for one in texts for text in unique_texts(one)[0] for mark in (separator, '"', "\n"))
+    style = "needed" if special else "none"  # "needed" quotes every text
+    yield (
+        separator.join(f'"{name}"' if special else name for name in columns) + "\n"
+    )  # releases of pyarrow differ in it
+    options = csv.WriteOptions(include_header=False, delimiter=separator, quoting_style=style)
+    for start in range(0, len(next(iter(columns.values()), ())), _ROWS):
+        part = io.BytesIO()
+        csv.write_csv(to_arrow({name: one[start : start + _ROWS] for name, one in columns.items()}), part, options)
+        yield part.getvalue()
 
 
 def frame_files(folder: Path) -> list[Path]:

@@ -9,7 +9,9 @@ from optipmb_client.errors import UsageError
 from optipmb_schemas import PATHS
 from optipmb_tools.datasets import Dataset, Preloaded, open_dataset, selected_frames
 from optipmb_tools.evaluation.tracks import read_tracks
+from optipmb_tools.results.output import track_columns
 from optipmb_tools.run.profiles import read_profile
+from optipmb_tools.run.spool import BLOCK, SpooledTracks
 from optipmb_tools.run.tracking import Tracking, decided, track, track_whole
 
 from optipmb.learning.hindsight import with_hindsight
@@ -128,3 +130,22 @@ def test_values_that_the_tracker_refuses_are_placed(dataset: Dataset) -> None:
     loaded._frames[3] = replace(loaded._frames[3], score=loaded._frames[3].score + 1.0)
     with pytest.raises(UsageError, match=r"sequence 0000, frame 3: score"):
         track_whole(read_profile("kitti"), loaded)
+
+
+def test_spooled_tracks_are_those_that_were_added(dataset: Dataset) -> None:
+    """In a file and in memory, in any order, with other values of a column, and as a table."""
+    (sequence,), parameters = dataset.sequences(["0000"]), read_profile("scene")
+    frames = list(track_whole(parameters, sequence).tracks.values())
+    spooled, count = SpooledTracks(), 2 * BLOCK + 90
+    for index in reversed(range(count)):
+        spooled.add(index, frames[index % len(frames)])
+    assert list(spooled) == list(range(count))
+    for index in (0, BLOCK, count - 1, 5, BLOCK - 1):
+        assert spooled[index] == frames[index % len(frames)]
+    score = spooled.columns({"score": lambda one: 0.5 * one.score})["score"]
+    changed = spooled.with_columns({"score": score})
+    for index in (count - 1, BLOCK, 3):
+        assert changed[index].score.tolist() == (0.5 * spooled[index].score).tolist()
+    table = track_columns("a", changed)
+    assert table["id"].tolist() == [number for one in spooled.values() for number in one.id.tolist()]
+    assert table["frame"].tolist() == [k for k, one in spooled.items() for _ in one.id]

@@ -44,6 +44,7 @@ DECIMALS: Final = {
 }
 """Decimals of columns in text: 0.1 mm, 1e-4 rad, 1 mm/s, probabilities to 1e-4."""
 FULL: Final = "full"  # digits of text that give every bit of a number
+_BLOCK: Final = 1024  # frames whose columns are made at once
 _RANKED: Final = {".txt", ".json"}
 SHOWN: Final = "shown"
 """Folder beside the result files of a benchmark, which rank all tracks: the same files of the tracks that are shown."""
@@ -69,7 +70,28 @@ def track_columns(
         objects: Which object each track is of; adds `object` and `object_probability`.
     """
     order = sorted(tracks)
-    parts = [tracks[index] for index in order]
+    more: dict[str, Any] = {"full": full, "georeference": georeference, "objects": objects}
+    blocks: dict[str, list[NDArray[Any]]] = {}
+    for start in range(0, max(len(order), 1), _BLOCK):  # of a long recording not all messages are in memory
+        block = {index: tracks[index] for index in order[start : start + _BLOCK]}
+        for column, values in _columns_of(name, block, sequence, **more).items():
+            blocks.setdefault(column, []).append(values)
+    last = max(map(len, blocks.values()))  # a block without `object` is one of frames without it
+    blocks = {column: parts for column, parts in blocks.items() if len(parts) == last}
+    return {column: np.concatenate(blocks.pop(column)) for column in list(blocks)}
+
+
+def _columns_of(
+    name: str,
+    tracks: Mapping[int, Tracks],
+    sequence: "DataSequence | None",
+    *,
+    full: bool,
+    georeference: "Georeference | None",
+    objects: "Objects | None",
+) -> Columns:
+    """Return the columns of some frames; arguments as for `track_columns`."""
+    order, parts = list(tracks), list(tracks.values())
     frame = np.repeat(np.array(order, dtype=np.int64), [len(one.id) for one in parts])
     stamps = np.repeat(np.array([one.stamp_ns for one in parts], dtype=np.int64), [len(one.id) for one in parts])
     names = [np.asarray(one.labels, np.str_)[one.label] for one in parts]
@@ -112,12 +134,14 @@ def track_columns(
 
 
 def write_tracks(path: Path, columns: Columns, digits: str) -> None:
-    """Write columns of tracks as a table; numbers in text have the decimals of `DECIMALS`, with `FULL` all digits."""
-    if digits != FULL and is_text(path):
-        columns = {
-            name: np.round(values, DECIMALS[name]) + 0.0 if name in DECIMALS and values.dtype.kind == "f" else values
-            for name, values in columns.items()
-        }
+    """Write columns of tracks as a table; numbers in text have the decimals of `DECIMALS`, with `FULL` all digits.
+
+    Numbers are rounded in place, as a copy of a long table would double its memory.
+    """
+    for name, values in columns.items() if digits != FULL and is_text(path) else ():
+        if name in DECIMALS and values.dtype.kind == "f":
+            np.round(values, DECIMALS[name], out=values)
+            values += 0.0  # noqa: PLW2901  in place; -0 becomes 0
     write_table(path, columns)
 
 
@@ -165,10 +189,13 @@ class TrackCounts(NamedTuple):
 
     @classmethod
     def of(cls, frames: Iterable[Tracks]) -> Self:
-        parts = [(one.id, shown(one)) for one in frames]
-        confirmed = [ids[rows] for ids, rows in parts]
-        rows = sum(len(ids) for ids, _ in parts)
-        return cls(len({number for one in confirmed for number in one.tolist()}), rows, rows - sum(map(len, confirmed)))
+        ids: set[int] = set()
+        rows = confirmed = 0
+        for one in frames:
+            numbers = one.id[shown(one)]
+            ids.update(numbers.tolist())
+            rows, confirmed = rows + len(one.id), confirmed + len(numbers)
+        return cls(len(ids), rows, rows - confirmed)
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,13 @@ poses is estimated: only recordings can begin anew when later frames show that i
 
 import functools
 import itertools
+import operator
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,16 +42,21 @@ from optipmb.learning.hindsight import with_hindsight
 from optipmb.learning.self_calibration import learned_noise
 from optipmb.learning.sensor_motion import UNKNOWN_MOTION
 from optipmb.learning.velocity_check import EXPECTED, VelocityCheck
+from optipmb.model.density import STATE, V
 from optipmb.model.parameters import ALIKE
 from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame, selected_frames
 from optipmb_tools.files import remove_unfinished
 from optipmb_tools.results.output import Latency, Results, TrackCounts, horizons_for, latency
 from optipmb_tools.run.bulk import Executor, Failed, Here, in_order, run
+from optipmb_tools.run.spool import SpooledTracks
 from optipmb_tools.table_files import Columns
 
 if TYPE_CHECKING:
     from optipmb_tools.run.rejoining import RejoinOptions
 
+_TOLD = ("id", "label", "existence", "age", "time_since_detection")  # columns that tell whether tracks are shown
+_MOTION = ("acceleration", "yaw", "yaw_rate", "velocity")
+_VARIANCE: Mapping[str, Callable[[Tracks], NDArray[Any]]] = {"covariance": lambda one: one.covariance[:, V, V]}
 SHOWN = 20  # recordings that failed, named in the error
 
 
@@ -61,7 +68,7 @@ def _ignored() -> None:
 class Tracked:
     """Tracks of one sequence by frame index, and counts."""
 
-    tracks: dict[int, Tracks]
+    tracks: SpooledTracks
     clouds: int
     detections: int
     left_out: dict[str, int]  # detections of each class that the profile lacks, or that are below its score filter
@@ -132,7 +139,7 @@ def track_whole(
     """
     _warm()
     begun = time.monotonic()
-    found: dict[int, Tracks] = {}
+    found = SpooledTracks()
     steps: list[int] = []
     checks: defaultdict[str, VelocityCheck] = defaultdict(VelocityCheck)  # by sensor
     clouds = detections = estimated = 0
@@ -160,7 +167,7 @@ def track_whole(
             return track_whole(
                 parameters, sequence, classes, modules, sensors=sensors, on_frame=left, sensor=UNKNOWN_MOTION
             )
-        found[frame.index] = _message(parameters, sequence, frame, result)
+        found.add(frame.index, _message(parameters, sequence, frame, result))
         if smoother is not None:
             smoother.add(frame.index, density, result.tracks)
         checks[frame.sensor].add(taken, estimated=density.sensor_motion is not None)
@@ -175,9 +182,11 @@ def track_whole(
         on_frame()
     left_out.update(_below_filters(parameters.labels, low, given))
     if smoother is not None:
+        smoothed = SpooledTracks()
         for index, one in smoother.tracks():
             paths = predict_tracks(one, parameters.horizons, parameters) if parameters.horizons else None
-            found[index] = found[index].model_copy(update=fields_of(one, paths))
+            smoothed.add(index, found[index].model_copy(update=fields_of(one, paths)))
+        found = smoothed
     counts = clouds, detections, dict(left_out), estimated
     doubts = tuple(one.contradiction for one in checks.values() if one.contradiction)
     return Tracked(found, *counts, learned_noise(density), doubts, tuple(steps), time.monotonic() - begun)
@@ -271,19 +280,19 @@ class Tracking:
     view: Path | None = None  # page of the tracks, of one sequence
 
 
-def decided(tracked: Tracked, how: Tracking) -> dict[int, Tracks]:
+def decided(tracked: Tracked, how: Tracking) -> SpooledTracks:
     """Return the tracks by frame index, confirmed as `how` says; velocities change where all frames have equal axes."""
-    found = dict(sorted(tracked.tracks.items()))
-    changed: list[dict[str, NDArray[Any]]] = [{} for _ in found]
-    if how.hindsight_s:
+    found = tracked.tracks
+    if how.hindsight_s and len(found):
         velocity_s = 0.0 if how.smooth or tracked.estimated else how.hindsight_s
-        changed = with_hindsight(list(found.values()), how.parameters, velocity_s=velocity_s, show=how.show)
-    elif how.show is not None:
-        changed = [{"confirmed": one.existence >= how.show} for one in found.values()]
-    for index, columns in zip(found, changed, strict=True):
-        if columns:
-            update = columns | {"confirmed": columns["confirmed"].astype(np.int64)}
-            found[index] = found[index].model_copy(update=update)
+        names = [*_TOLD, *(_MOTION if velocity_s else ())]
+        rows = found.columns({**{name: operator.attrgetter(name) for name in names}, **_VARIANCE})
+        rows["covariance"] = np.broadcast_to(rows["covariance"][:, None, None], (len(rows["id"]), STATE, STATE))
+        (changed,) = with_hindsight([SimpleNamespace(**rows)], how.parameters, velocity_s=velocity_s, show=how.show)
+        return found.with_columns(changed | {"confirmed": changed["confirmed"].astype(np.int64)})
+    if how.show is not None and len(found):
+        shown = found.columns({"existence": operator.attrgetter("existence")})["existence"] >= how.show
+        return found.with_columns({"confirmed": shown.astype(np.int64)})
     return found
 
 
@@ -331,7 +340,10 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
     objects = None if how.rejoin is None else how.rejoin.objects(found.tracks, how.parameters)
     joined = None if objects is None else (len(objects.id), len(np.unique(objects.object)))
     if objects is not None and how.ids == "object":
-        found = replace(found, tracks={index: objects.as_ids(one) for index, one in found.tracks.items()})
+        joined_tracks = SpooledTracks()
+        for index, one in found.tracks.items():
+            joined_tracks.add(index, objects.as_ids(one))
+        found = replace(found, tracks=joined_tracks)
         objects = None
     written = Results(dataset, job.out, full=how.full).write(sequence, found.tracks, objects)
     if how.view is not None:
