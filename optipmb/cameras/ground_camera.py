@@ -399,7 +399,11 @@ class GroundCamera(ParameterTable):
     def _size(self, name: str) -> tuple[float, ...]:
         """Return length, width, height and spread of heights of a class."""
         own = self.classes.get(like(name, tuple(self.classes)) or "", ClassSize())
-        spread = own.height_sd or (0.08 if common_name(name) == "pedestrian" else 0.1)
+        kind = common_name(name)
+        spread = 0.08 if kind == "pedestrian" else 0.1
+        if own.size is None and kind in {"car", "truck", "bus"}:
+            spread = 0.14  # mean heights of cars differ by a sixth between countries
+        spread = own.height_sd or spread
         return (*(own.size or usual_size(name)), spread)
 
     def _placed(self, boxes: _Boxes) -> tuple[Array, Array, Array]:

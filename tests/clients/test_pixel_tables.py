@@ -234,3 +234,23 @@ def test_boxes_of_coco_are_places(tmp_path: Path, camera: optipmb.GroundCamera, 
     for frame in plain.frames():
         if len(frame):
             assert np.allclose(found[frame.stamp_ns][:, :2], frame.center[:, :2], atol=1e-6)
+
+
+def test_usual_heights_are_named_and_less_exact(tmp_path: Path, camera: optipmb.GroundCamera) -> None:
+    """On a vehicle, ranges by the usual height of a class have wider covariances than by one that the file states."""
+    del camera
+    own = tmp_path / "own.toml"
+    text = (tmp_path / "car.toml").read_text().replace('range = "ground"', 'range = "height"')
+    (tmp_path / "usual.toml").write_text(text)
+    own.write_text(text + "[class.car]\nsize = [4.5, 1.9, 1.6]\n")
+    pose = optipmb.Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+    box = np.array([[900.0, 560.0, 960.0, 620.0]])
+    usual, stated = (
+        optipmb.GroundCamera.read(path).detections(box=box, label=["car"], pose=pose)["position_covariance"][0, 0, 0]
+        for path in (tmp_path / "usual.toml", own)
+    )
+    assert usual > 1.5 * stated
+    table = write(tmp_path / "a.csv", optipmb.GroundCamera.read(tmp_path / "gate.toml"), "x1,y1,x2,y2", ",0,0,0,0")
+    for path, said in ((tmp_path / "usual.toml", True), (own, False)):
+        notes = TableDataset(table, {"camera": str(path)}).notes
+        assert any("usual heights of car" in one for one in notes) == said

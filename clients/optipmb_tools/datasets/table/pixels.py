@@ -11,10 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from optipmb_schemas import FieldOfView
 
+from optipmb_tools.datasets.interface import class_like
 from optipmb_tools.datasets.table.columns import normalised
 from optipmb_tools.datasets.table.findings import Claim, Reading
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Floats, Ints, Pose, rotation_of, to_sensor, to_world
+from optipmb_tools.table_files import unique_texts
 
 if TYPE_CHECKING:
     from optipmb import GroundCamera
@@ -134,6 +136,10 @@ def place(
         kept = mine[one["row"]]
         center[kept], covariance[kept] = one["center"], one["position_covariance"]
         left_out.update(one["left_out"])
+    usual = [one for one in unique_texts(labels[rows])[0].tolist() if not class_like(one, tuple(camera.classes))]
+    if camera.range != "ground" and usual:
+        text = f"ranges follow from usual heights of {', '.join(usual)}"
+        reading.note("camera", f"{text}: [class.NAME] size in the calibration has the real ones")
     if left_out:
         reasons = ", ".join(f"{count} {reason}" for reason, count in sorted(left_out.items()))
         text = f"{left_out.total()} of {len(rows)} boxes have no place on the ground: {reasons}"
