@@ -305,7 +305,7 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--root", type=Path, help="folder with kitti/, nuscenes/ and nuscenes-more/")
-    parser.add_argument("--seeds", type=int, nargs="*", default=range(21, 27))
+    parser.add_argument("--seeds", type=int, nargs="*", default=range(31, 37))
     parser.add_argument("--frames", type=int, default=900, help="of the generated traffic; 0: without it")
     parser.add_argument("--online", action="store_true", help="join while tracking")
     parser.add_argument("--scenes", nargs="*", default=list(SCENES), choices=list(SCENES))

@@ -49,14 +49,16 @@ from optipmb.joining.places import (
     in_exit,
     learned_score,
     passage_score,
+    return_score,
     with_beginnings,
+    with_ends,
     with_returns,
 )
-from optipmb.joining.records import beginnings_in, returns_in, selected, statistics_in, tracklets_in
+from optipmb.joining.records import beginnings_in, ends_in, returns_in, selected, statistics_in, tracklets_in
 from optipmb.model.attributes import Attributes, gathered
 from optipmb.model.errors import ParameterError
 from optipmb.model.frame import LONGEST_MODEL
-from optipmb.model.lost_objects import Beginnings, Lost, Places, Rejoining, Returns, Statistics, Tracklets
+from optipmb.model.lost_objects import Beginnings, Ends, Lost, Places, Rejoining, Returns, Statistics, Tracklets
 from optipmb.model.polygons import check_polygon
 from optipmb.model.tracks import Tracks, tracks_in
 
@@ -178,7 +180,7 @@ def _candidates(live: Tracklets, lost: Tracklets, stamp_ns: int, young: int) -> 
 
 @kernel
 def _scores(
-    tables: tuple[Tracklets, Tracklets, Beginnings, Returns, Statistics],
+    tables: tuple[Tracklets, Tracklets, Beginnings, Returns, Ends, Statistics],
     ends: Index,
     young: Index,
     due: Flags,
@@ -191,7 +193,7 @@ def _scores(
     Only pairs connected with a decision by pairs that may be joined are scored.
 
     Args:
-        tables: lost objects, live tracks, beginnings, returns and statistics of classes.
+        tables: lost objects, live tracks, beginnings, returns, ends and statistics of classes.
         ends: (E,) rows of the lost objects and, behind these, of live tracks.
         young: (M,) rows of live tracks that began lately.
         due: (M,) those on which to decide.
@@ -199,10 +201,11 @@ def _scores(
         kinds: the fields of `Kinds`.
         looks: vectors and attributes of the tracks and of the lost objects.
     """
-    (lost, live, begun, returns, known), (motion, kind, area, plan), (stamp_ns, gap_s) = tables, kinds, moment
+    (lost, live, begun, returns, gone, known), (motion, kind, area, plan), (stamp_ns, gap_s) = tables, kinds, moment
     declared, many = DeclaredPlaces(*plan), lost.id.shape[0]
     score, appeared = np.full((ends.shape[0], young.shape[0]), math.nan), np.zeros((ends.shape[0], young.shape[0]))
     vectors, texts = looks
+    again = np.full(ends.shape[0], math.nan)
     wanted, used, grows = due.copy(), np.zeros(ends.shape[0], np.bool_), True
     news = np.zeros(area.shape[0])
     for n in range(begun.id.shape[0]):
@@ -227,6 +230,9 @@ def _scores(
                     way, share = passage_score(table, n, live, k, declared), 0.0
                     if way == -math.inf:
                         way, share = learned_score(table, n, live, k, c, returns)
+                        if math.isnan(again[at]):
+                            again[at] = return_score(gone, c, table.end[n])
+                        value += again[at]
                     value = log_sum(value + math.log1p(-share), way)
                     sizes = known.count[c], known.mean[c], known.square[c]
                     value += size_score(table.size[n], live.size[k], sizes[0], sizes[1], sizes[2], LEAST_SIZES)
@@ -313,18 +319,18 @@ def _continue(live: Tracklets, k: int, table: Tracklets, row: int, probability: 
 
 @kernel
 def decide(
-    given: tuple[Array, Array, Array, Array, Array],
+    given: tuple[Array, Array, Array, Array, Array, Array],
     young: Index,
     due: Flags,
     stamp_ns: int,
     kinds: Columns,
     limits: tuple[float, float],
     looks: tuple[Vectors, KnownTexts],
-) -> tuple[Array, Array, Array, Index]:
+) -> tuple[Array, Array, Array, Array, Index]:
     """Decide on new tracks: write their objects to the words of the live tracks, and sizes to the words of the classes.
 
     Args:
-        given: words of the live tracks, the lost objects, the beginnings, the returns and the classes.
+        given: words of the live tracks, the lost objects, the beginnings, the returns, the ends and the classes.
         young: (M,) rows of live tracks that began lately.
         due: (M,) those on which to decide.
         stamp_ns: of the frame.
@@ -333,14 +339,14 @@ def decide(
         looks: vectors and attributes of the tracks and of the lost objects.
 
     Returns:
-        The words of the lost objects, the beginnings and the returns, and the rows of live tracks that were joined:
-        they are not detected any more, and end.
+        The words of the lost objects, the beginnings, the returns and the ends, and the rows of live tracks that were
+        joined: they are not detected any more, and end.
     """
-    live_words, lost_words, begun_words, return_words, class_words = given
+    live_words, lost_words, begun_words, return_words, end_words, class_words = given
     live, lost, known = tracklets_in(live_words), tracklets_in(lost_words), statistics_in(class_words)
     kind, many = kinds[1], lost.id.shape[0]
     ends = _candidates(live, lost, stamp_ns, young.shape[0])
-    tables = lost, live, beginnings_in(begun_words), returns_in(return_words), known
+    tables = lost, live, beginnings_in(begun_words), returns_in(return_words), ends_in(end_words), known
     score, appeared = _scores(tables, ends, young, due, (stamp_ns, limits[0]), kinds, looks)
     if looks[0].total.shape[1] > 0:
         _count_gaps(score - appeared, (lost, live), ends, young, due, kind, looks[0])
@@ -349,6 +355,7 @@ def decide(
     before, after, gain = _positive(score)
     taken, margin, odds = match(before, after, gain, due, ends.shape[0])
     kept, gone = np.ones(many, np.bool_), np.zeros(live.id.shape[0], np.bool_)
+    returned = np.zeros(many), np.zeros(live.id.shape[0])
     for m in decided:
         k, best = young[m], -1
         count_sizes(known, kind[live.label[k]], live.size[k])
@@ -365,15 +372,17 @@ def decide(
         _name_candidate(live, k, table, at, margin[n])
         if probability >= limits[1]:
             if row < many:
-                kept[row] = False
+                kept[row], returned[0][at] = False, probability
                 _continue(live, k, lost, row, probability)
             else:
-                gone[row - many] = True
+                gone[at], returned[1][at] = True, probability
                 _continue(live, k, live, row - many, probability)
+    end_words = with_ends(end_words, lost, np.flatnonzero(~kept), returned[0], stamp_ns, kind)
+    end_words = with_ends(end_words, live, np.flatnonzero(gone), returned[1], stamp_ns, kind)
     if not kept.all():
         lost_words = selected(lost_words, np.flatnonzero(kept), TRACKLETS)
     begun_words = with_beginnings(begun_words, live, young[decided], odds[decided], stamp_ns, kinds, known)
-    return lost_words, begun_words, return_words, np.flatnonzero(gone)
+    return lost_words, begun_words, return_words, end_words, np.flatnonzero(gone)
 
 
 @kernel
@@ -422,7 +431,7 @@ def advance(
     kinds: Columns,
     limits: tuple[float, float, float, int],
     looks: tuple[Columns, Columns],
-) -> tuple[Array, Array, Array, Array, Array, Array, Index, Array, Index, Array, Index, int, int]:
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, Index, Array, Index, Array, Index, int, int]:
     """Return the words of `Rejoining` after a frame.
 
     Args:
@@ -437,7 +446,7 @@ def advance(
         objects that were joined while they were not detected; and the numbers of joins and of lost objects that were
         dropped because there were too many.
     """
-    live_words, place_words, lost_words, begun_words, return_words, class_words = given
+    live_words, place_words, lost_words, begun_words, return_words, end_words, class_words = given
     gap_s, least, decide_s, most = limits
     track_words, object_words, stamp_ns = moment
     live_words, place_words, lost_words = follow(
@@ -449,8 +458,8 @@ def advance(
     if due.any():
         class_words = class_words.copy()
         had = live.object.copy()
-        lost_words, begun_words, return_words, rows = decide(
-            (live_words, lost_words, begun_words, return_words, class_words),
+        lost_words, begun_words, return_words, end_words, rows = decide(
+            (live_words, lost_words, begun_words, return_words, end_words, class_words),
             young,
             due,
             stamp_ns,
@@ -466,8 +475,12 @@ def advance(
             live_words = selected(live_words, others, TRACKLETS)
             place_words = selected(place_words, others, PLACE_COLUMNS)
             live = tracklets_in(live_words)
+    lost = tracklets_in(lost_words)
+    late = np.flatnonzero((stamp_ns - lost.last_ns) * _NS > gap_s)
+    if gap_s > 0.0:  # while nothing is joined, nothing returns
+        end_words = with_ends(end_words, lost, late, np.zeros(lost.id.shape[0]), stamp_ns, kinds[1])
     lost_words, dropped = _within_limits(lost_words, stamp_ns, gap_s, most)
-    words = live_words, place_words, lost_words, begun_words, return_words, class_words
+    words = live_words, place_words, lost_words, begun_words, return_words, end_words, class_words
     return *words, *_objects_of(tracks_in(track_words).id, live), ends, joined, dropped
 
 
@@ -519,7 +532,7 @@ def rejoin_tracks(
         FrameError: vectors of another length than before.
     """
     state = before or Rejoining.empty(len(kinds.kind), density.stamp_ns)
-    parts = state.live, state.places, state.lost, state.beginnings, state.returns, state.classes
+    parts = state.live, state.places, state.lost, state.beginnings, state.returns, state.ends, state.classes
     given = tuple(one.words for one in parts)
     gap_s = settings.gap_s if density.sensor_motion is None else 0.0
     limits = gap_s, settings.min_probability, settings.decide_s, settings.most
@@ -539,13 +552,14 @@ def rejoin_tracks(
         limits,
         (tuple(vectors), tuple(KnownTexts.of(density.attributes))),
     )
-    live, places, lost, begun, returns, known = words
+    live, places, lost, begun, returns, ends, known = words
     after = Rejoining(
         Tracklets.of(live),
         Places.of(places),
         Lost.of(lost),
         Beginnings.of(begun),
         Returns.of(returns),
+        Ends.of(ends),
         Statistics.of(known),
     )
     if looks is not None:

@@ -20,8 +20,8 @@ import numpy as np
 
 from optipmb.compiled import kernel
 from optipmb.joining.evidence import RETURNS, log_sum
-from optipmb.joining.records import beginnings_in, copy_rows, layout_of, returns_in, tracklets_in
-from optipmb.model.lost_objects import Beginnings, Returns
+from optipmb.joining.records import beginnings_in, copy_rows, ends_in, layout_of, returns_in, tracklets_in
+from optipmb.model.lost_objects import Beginnings, Ends, Returns
 from optipmb.model.polygons import inside
 
 if TYPE_CHECKING:
@@ -44,6 +44,11 @@ LEARNED_NS: Final = 600 * 10**9
 """Time in which returns teach where others return."""
 ELSEWHERE_M: Final = 6.0
 """Returns nearer to where they were lost teach nothing: motion says more, and at a door others come out."""
+LIKELY: Final = (0.02, 0.8)
+"""Bounds of the probability that an object returns which was lost at a place, and"""
+PRIOR_ENDS: Final = 2.0
+"""ends that weigh as much as what is supposed of any place, `RETURNS`."""
+MOST_ENDS: Final = 500
 LEARNED: Final = 0.8
 """Share of the returns that are like others, if many are known; it is half from"""
 FIRST_RETURNS: Final = 0.5
@@ -54,8 +59,10 @@ MOST_BEGINNINGS: Final = 2000
 _NS: Final = 1e-9
 BEGINNING: Final = Beginnings.width
 RETURN: Final = Returns.width
+END: Final = Ends.width
 BEGINNING_COLUMNS: Final = layout_of(Beginnings)
 RETURN_COLUMNS: Final = layout_of(Returns)
+END_COLUMNS: Final = layout_of(Ends)
 
 Polygon = tuple[tuple[float, float], ...]
 
@@ -217,6 +224,36 @@ def learned_score(i: Tracklets, n: int, j: Tracklets, k: int, kind: int, returns
         total += weight * time * math.exp(-0.5 * square / KERNEL_M**2) / (2.0 * math.pi * KERNEL_M**2)
     share = LEARNED * weights / (weights + FIRST_RETURNS)
     return math.log(RETURNS * share * total / weights) if total > 0.0 else -math.inf, share
+
+
+@kernel
+def return_score(ends: Ends, kind: int, place: Array) -> float:
+    """Return the log ratio of the probability that an object returns which was lost at a place (2,), and `RETURNS`."""
+    total, returned, far = PRIOR_ENDS, PRIOR_ENDS * RETURNS, (5.0 * KERNEL_M) ** 2
+    for n in range(ends.id.shape[0]):
+        square = (ends.place[n, 0] - place[0]) ** 2 + (ends.place[n, 1] - place[1]) ** 2
+        if square < far and ends.kind[n] == kind:
+            weight = math.exp(-0.5 * square / KERNEL_M**2)
+            total, returned = total + weight, returned + weight * ends.returned[n]
+    return math.log(min(max(returned / total, LIKELY[0]), LIKELY[1]) / RETURNS)
+
+
+@kernel
+def with_ends(end_words: Array, table: Tracklets, rows: Index, returned: Array, stamp_ns: int, kind: Index) -> Array:
+    """Return the words of the ends of the last time, and of rows that have returned, or not (`returned`, of all)."""
+    if rows.shape[0] == 0:
+        return end_words
+    recent = np.flatnonzero(ends_in(end_words).stamp_ns >= stamp_ns - LEARNED_NS)
+    rows = rows[:MOST_ENDS]
+    recent = recent[max(0, recent.shape[0] + rows.shape[0] - MOST_ENDS) :]
+    more = np.empty((recent.shape[0] + rows.shape[0]) * END)
+    found = ends_in(more)
+    copy_rows(end_words, recent, more, np.arange(recent.shape[0]), END_COLUMNS)
+    for p in range(rows.shape[0]):
+        at, n = recent.shape[0] + p, rows[p]
+        found.id[at], found.kind[at], found.stamp_ns[at] = table.id[n], kind[table.label[n]], stamp_ns
+        found.place[at], found.returned[at] = table.end[n], returned[n]
+    return more
 
 
 @kernel

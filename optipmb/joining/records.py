@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from optipmb.compiled import kernel
-from optipmb.model.lost_objects import Beginnings, Places, Returns, Statistics, Tracklets
+from optipmb.model.lost_objects import Beginnings, Ends, Places, Returns, Statistics, Tracklets
 from optipmb.model.rows import arrays_of, views_of
 
 if TYPE_CHECKING:
@@ -21,6 +21,8 @@ BeginningArrays: Final = arrays_of(Beginnings, "BeginningArrays", __name__)
 beginnings_in: Final = views_of(Beginnings, BeginningArrays, "beginnings_in", __file__)
 ReturnArrays: Final = arrays_of(Returns, "ReturnArrays", __name__)
 returns_in: Final = views_of(Returns, ReturnArrays, "returns_in", __file__)
+EndArrays: Final = arrays_of(Ends, "EndArrays", __name__)
+ends_in: Final = views_of(Ends, EndArrays, "ends_in", __file__)
 StatisticArrays: Final = arrays_of(Statistics, "StatisticArrays", __name__)
 statistics_in: Final = views_of(Statistics, StatisticArrays, "statistics_in", __file__)
 

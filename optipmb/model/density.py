@@ -27,6 +27,7 @@ from optipmb.model.lost_objects import (
     EMBEDDING,
     Appearance,
     Beginnings,
+    Ends,
     Lost,
     Places,
     Rejoining,
@@ -317,7 +318,7 @@ SENSOR: Final = "sensor"
 MOST_COUNTED: Final = 1e9
 """Bound of stored counts of scores and of the sensor's motion, far above all that the tracker makes."""
 
-JOINING: Final = (Tracklets, Places, Lost, Beginnings, Returns, Statistics)
+JOINING: Final = (Tracklets, Places, Lost, Beginnings, Returns, Ends, Statistics)
 """Records of `Density.rejoining`, in the order of its fields."""
 
 APPEARANCE: Final = "rejoin.appearance"
@@ -380,7 +381,9 @@ def columns_of(density: Density) -> dict[str, NDArray[Any]]:
 
 def _records(density: Density) -> list[Rows]:
     own = density.rejoining
-    joining = () if own is None else (own.live, own.places, own.lost, own.beginnings, own.returns, own.classes)
+    joining: tuple[Rows, ...] = ()
+    if own is not None:
+        joining = own.live, own.places, own.lost, own.beginnings, own.returns, own.ends, own.classes
     records = density.bernoulli, density.poisson, density.misses, *joining, density.attributes
     return [rows for rows in records if rows is not None]
 
@@ -549,8 +552,8 @@ def _attributes(columns: Mapping[str, Any], next_id: int) -> Attributes:
 
 def _rejoining(columns: Mapping[str, Any], stamp_ns: int, next_id: int, classes: int) -> Rejoining:
     """Return the state of the joining of tracks, whose rows fit together."""
-    live, places, lost, begun, returns, known = (_rows(kind, columns) for kind in JOINING)
-    found = Rejoining(live, places, lost, begun, returns, known)  # type: ignore[arg-type]  # in this order
+    live, places, lost, begun, returns, ends, known = (_rows(kind, columns) for kind in JOINING)
+    found = Rejoining(live, places, lost, begun, returns, ends, known)  # type: ignore[arg-type]  # in this order
     for rows in (found.live, found.lost):
         for name, column, low, high in (
             ("id", np.diff(rows.id, prepend=0), 1, next_id),
@@ -580,6 +583,9 @@ def _rejoining(columns: Mapping[str, Any], stamp_ns: int, next_id: int, classes:
         (f"{Returns.part}.kind", found.returns.kind, classes - 1),
         (f"{Returns.part}.stamp_ns", found.returns.stamp_ns, stamp_ns),
         (f"{Returns.part}.weight", found.returns.weight, 1),
+        (f"{Ends.part}.kind", found.ends.kind, classes - 1),
+        (f"{Ends.part}.stamp_ns", found.ends.stamp_ns, stamp_ns),
+        (f"{Ends.part}.returned", found.ends.returned, 1),
     ):
         if column.size and not 0 <= column.min() <= column.max() <= most:
             raise DensityError(path, f"from 0 to {most}", f"{column.min()} to {column.max()}")

@@ -143,6 +143,27 @@ class Returns(Rows):
     weight = Column(np.float64)
 
 
+class Ends(Rows):
+    """Where objects were lost, and whether they have returned.
+
+    Attributes:
+        id: (N,) int64 of the last track.
+        kind: (N,) int64 first class of its group.
+        stamp_ns: (N,) int64 when that was known.
+        place: (N, 2) m.
+        returned: (N,) probability that the object has returned; 0 where nothing was joined in time.
+    """
+
+    part = "rejoin.ends"
+    __slots__ = ()
+
+    id = Column(np.int64)
+    kind = Column(np.int64)
+    stamp_ns = Column(np.int64)
+    place = Column(np.float64, 2)
+    returned = Column(np.float64)
+
+
 class Statistics(Rows):
     """Of each class (C,); the row of its first class holds a group.
 
@@ -219,6 +240,7 @@ class Rejoining:
     lost: Lost
     beginnings: Beginnings
     returns: Returns
+    ends: Ends
     classes: Statistics
     appearance: Appearance | None = None
 
@@ -228,7 +250,8 @@ class Rejoining:
         none = np.zeros((classes, 3))
         since = np.full(classes, stamp_ns)
         known = Statistics(since_ns=since, settled_ns=since + SETTLES_NS, count=none, mean=none, square=none)
-        return cls(Tracklets.empty(), Places.empty(), Lost.empty(), Beginnings.empty(), Returns.empty(), known)
+        begun = Beginnings.empty(), Returns.empty(), Ends.empty()
+        return cls(Tracklets.empty(), Places.empty(), Lost.empty(), *begun, known)
 
     def with_sensor(self, stamp_ns: int) -> Rejoining:
         """Return the state before the first frame of another sensor, which sees objects that were there before."""

@@ -107,6 +107,7 @@ class Relocation(NamedTuple):
             places=state.places.replaced(place=places),
             lost=tracks(state.lost),
             beginnings=state.beginnings.replaced(place=self.points(state.beginnings.place)),
+            ends=state.ends.replaced(place=self.points(state.ends.place)),
             returns=state.returns.replaced(
                 **{name: self.points(getattr(state.returns, name)) for name in ("start", "end")}
             ),

@@ -13,7 +13,7 @@ from scipy.stats import lognorm
 import optipmb
 from optipmb import OnlineTracker, ParameterError, Passage, Rejoin, Relocation, Tracker, generic_parameters
 from optipmb.joining import places, records
-from optipmb.model.lost_objects import Returns, Tracklets
+from optipmb.model.lost_objects import Ends, Returns, Tracklets
 
 GENERIC = generic_parameters(gaps.CLASSES, 0.1)
 HIDDEN = gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0)))
@@ -108,6 +108,28 @@ def test_a_passage_joins_its_ends(s: tuple[float, float], expected: int) -> None
     way = Passage(box(18, -3, 30, 3), box(15, 34, 25, 46), s)
     assert last_objects(frames, Rejoin(passages=(way,))) == [expected]
     assert last_objects(frames, Rejoin()) == [2]
+
+
+@pytest.mark.parametrize("gap_s", [60.0, 3.0])
+def test_ends_teach_where_objects_return(gap_s: float) -> None:
+    """The end of a track that is joined counts with the probability of the join; after the gap, with none."""
+    *_, last = steps(HIDDEN, Rejoin(gap_s=gap_s))
+    assert last.density.rejoining is not None
+    assert last.joined is not None
+    ends = last.density.rejoining.ends
+    assert ends.id.tolist() == [1]
+    assert ends.place[0] == pytest.approx((23.2, 0.0), abs=0.3)
+    assert ends.returned.tolist() == pytest.approx([last.joined.probability[0] if gap_s > 4.0 else 0.0])
+
+
+def test_the_probability_of_a_return_is_that_of_ends_around() -> None:
+    """Ends near a place, of the same kind, count by their distance beside two that return every second time."""
+    ends = Ends.of(np.zeros(4 * Ends.width))
+    ends.id[:], ends.kind[:], ends.returned[:] = range(4), (0, 0, 1, 0), (1.0, 0.2, 1.0, 1.0)
+    ends.place[:] = (0, 0), (3, 0), (0, 0), (30, 0)
+    weight = np.exp(-0.5)
+    expected = (1.0 + 1.0 + 0.2 * weight) / (2.0 + 1.0 + weight)
+    assert places.return_score(records.ends_in(ends.words), 0, np.zeros(2)) == pytest.approx(np.log(expected / 0.5))
 
 
 def test_learned_scores_are_a_mixture_of_returns() -> None:
