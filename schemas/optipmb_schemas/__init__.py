@@ -39,6 +39,7 @@ from optipmb_schemas.messages import (
     Tracks,
     ZoneCount,
     ZoneEvent,
+    attributes_of_rows,
     path_fields,
     track_fields,
 )
@@ -85,6 +86,7 @@ __all__ = [
     "TracksRequest",
     "ZoneCount",
     "ZoneEvent",
+    "attributes_of_rows",
     "decode",
     "decode_dump",
     "encode",

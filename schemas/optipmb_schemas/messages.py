@@ -7,7 +7,7 @@ described here and nowhere else: the JSON Schemas and the tables of the document
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from itertools import chain
 from typing import Annotated, Any, Final, Literal
 
@@ -166,6 +166,13 @@ class Attribute(Message):
         for name in ("name", "text"):
             if len(getattr(self, name).encode()) > BRIEF or "\0" in getattr(self, name):
                 raise invalid(name, f"a text of at most {BRIEF} bytes", getattr(self, name))
+
+
+def attributes_of_rows(attributes: tuple[Attribute, ...] | None, rows: Iterable[int]) -> tuple[Attribute, ...] | None:
+    """Return the attributes of the chosen rows, with the places of these; None where there are none."""
+    place = {row: at for at, row in enumerate(rows)}
+    chosen = (one for one in attributes or () if one.row in place)
+    return tuple(one.model_copy(update={"row": place[one.row]}) for one in chosen) or None
 
 
 class Detections(SensorMessage):

@@ -13,6 +13,7 @@ from optipmb_schemas import Tracks, encode
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf import tracking_pb2_grpc as rpc
+from optipmb_service.edges.grpc.selection import Filter
 from proxy import Proxy
 from service_process import ServiceProcess
 
@@ -73,6 +74,20 @@ def test_the_first_tracks_of_a_subscription_in_force_come(service: ServiceProces
         call = subscribed(gateway.stub(), pattern=stream)
         tracked(stub, stream, range(3))
         assert [one.tracks.seq for one in taken(call, 3)] == [0, 1, 2]
+
+
+def test_attributes_go_with_their_tracks() -> None:
+    """A filter leaves those of the tracks that it chooses, by their new rows, and none where only columns are asked."""
+    proto = pb.Tracks(labels=["car", "pedestrian"])
+    for name, values in (("label", np.array([0, 1])), ("existence", np.ones(2)), ("age", np.ones(2))):
+        getattr(proto, name).CopyFrom(
+            pb.Array(shape=[2], data=values.tobytes(), dtype=convert.DTYPE_CODES[values.dtype.str[1:]])
+        )
+    proto.attributes.extend(pb.Attribute(row=row, name="plate", text=text) for row, text in enumerate("AB"))
+    chosen = Filter(pb.TrackFilter(classes=["pedestrian"])).of(proto)
+    assert [(one.row, one.text) for one in chosen.attributes] == [(0, "B")]
+    assert [one.row for one in proto.attributes] == [0, 1]
+    assert not Filter(pb.TrackFilter(fields=["label"])).of(proto).attributes
 
 
 def test_filters(stub: Any, stream: str) -> None:

@@ -127,6 +127,7 @@ def separate(frame: JsonFrame) -> Iterator[JsonFrame]:
             name: column[at : at + 1] for name in COLUMNS if (column := getattr(message, name)) is not None
         }
         values |= {"field_of_view": _beside(place, variance), "stamp_ns": message.stamp_ns + at * STEP_NS}
+        values["attributes"] = schemas.attributes_of_rows(message.attributes, [at])
         yield frame._replace(message=message.model_copy(update=values))
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from json_senders import Edge, damaged, document, exists, post
-from optipmb_schemas import MessageError, encode_json
+from optipmb_schemas import Attribute, MessageError, encode_json
 from optipmb_service.edges import access, inputs
 from optipmb_service.edges.http import detections
 from optipmb_service.edges.inputs import Inputs
@@ -393,6 +393,8 @@ def test_damaged_documents_get_a_path(edge: Edge, endpoint: str, way: str) -> No
             "invalid_value",
             "objects[1].embedding",
         ),
+        ({"objects": [CAR, CAR | {"attributes": {"plate": ""}}]}, "invalid_value", "objects[1].attributes"),
+        ({"objects": [CAR, CAR | {"attributes": {"plate": ["A", 2.0]}}]}, "invalid_value", "objects[1].attributes"),
         ({"objects": [CAR, CAR | {"yaw": 90}]}, "invalid_value", "objects[1].yaw"),
         ({"objects": [], "object": []}, "invalid_value", "object"),
         ({"objects": [], "frame": "sensor"}, "missing_field", "pose"),
@@ -442,6 +444,17 @@ def test_vectors_of_objects_are_columns() -> None:
     np.testing.assert_array_equal(found.message.embedding, [[3, 4], [np.nan, np.nan]])
     assert found.message.embedding_model == "reid-7"
     assert [np.shape(one.message.embedding) for one in separate(found)] == [(1, 2)] * 2
+
+
+def test_attributes_of_objects_are_theirs() -> None:
+    """A text may have a score, and stays with its object where the frame is split; errors name object and field."""
+    body = {"objects": [CAR, CAR | {"attributes": {"plate": ["AB 1", 0.5], "colour": "red"}}]}
+    found = FrameReader(Settings()).read(json.dumps(body).encode(), SENSOR.stream)
+    told = (Attribute(row=1, name="plate", text="AB 1", score=0.5), Attribute(row=1, name="colour", text="red"))
+    assert found.message.attributes == told
+    one, other = (part.message.attributes for part in separate(found))
+    assert one is None
+    assert other == tuple(each.model_copy(update={"row": 0}) for each in told)
 
 
 def test_latitude_and_heading_become_the_world(tmp_path: Path) -> None:

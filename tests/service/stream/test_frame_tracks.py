@@ -31,7 +31,8 @@ def made(tracks: optipmb.Tracks, *parts: Any, frame_id: FrameId = FRAME, **field
     """Tracks of a frame, with parts of the tracker's result that few profiles have."""
     header: dict[str, Any] = {"session": "0" * 32, "revision": 0, "profile": PARAMETERS.name, "cloud_used": False}
     header |= {"gap": 0, "ignored": 0, "labels": PARAMETERS.labels}
-    result = optipmb.StepResult(None, tracks, None, *parts)  # type: ignore[arg-type]  # of the tracks alone
+    empty = optipmb.Density.empty(PARAMETERS.labels)
+    result = optipmb.StepResult(empty, tracks, None, *parts)  # type: ignore[arg-type]  # of the tracks alone
     return tracks_of(result, fields.pop("stream", "a/b/c"), frame_id, **header | fields)
 
 
@@ -71,7 +72,8 @@ def test_what_few_sessions_have_is_in_the_bytes(count: int) -> None:
     mean, covariance = np.zeros((count, 5, 6)), np.broadcast_to(np.eye(6), (count, 5, 6, 6))
     paths = optipmb.PredictedPaths(one.id, one.label, np.arange(0.5, 3.0, 0.5), mean, covariance)
     classes = np.full((count, len(PARAMETERS.labels)), 1 / len(PARAMETERS.labels))
-    joined = Joined(None, one, one.id // 2, np.full(count, 0.9), 0, 0)  # type: ignore[arg-type]  # of the tracks alone
+    share = np.full(count, 0.9)
+    joined = Joined(None, one, one.id // 2, share, one.id // 2, share, 0, 0)  # type: ignore[arg-type]  # of the tracks alone
     tracks = made(one, paths, classes, np.full(count, 7), joined)
     tracks.others["relocation"] = schemas.Relocation(world=1, translation=np.ones(3), quaternion=np.eye(4)[0])
     payload = tracks.encoded(delivery(0))

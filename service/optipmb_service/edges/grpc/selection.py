@@ -43,8 +43,8 @@ class Filter:
         check_bound("filter.classes", len(asked.classes), MAX_NAMES)
         check_bound("filter.fields", len(asked.fields), MAX_NAMES)
         for row, field in enumerate(asked.fields):
-            if field not in schemas.Tracks.arrays:
-                expected = f"one of {', '.join(schemas.Tracks.arrays)}"
+            if field not in (known := (*schemas.Tracks.arrays, "attributes")):
+                expected = f"one of {', '.join(known)}"
                 raise schemas.MessageError("invalid_value", f"filter.fields[{row}]", expected, ascii(field)[:80])
         if not 0 <= asked.min_existence <= 1:
             raise schemas.MessageError(
@@ -65,6 +65,14 @@ class Filter:
                 chosen.ClearField(name)
             elif chosen.HasField(name) and array.rows == "N":
                 select(getattr(chosen, name), rows)
+        place = np.cumsum(rows) - 1
+        wanted = self._fields is None or "attributes" in self._fields
+        known = [one for one in chosen.attributes if wanted and rows[one.row]]
+        for one in known:
+            one.row = place[one.row]
+        kept = pb.Tracks(attributes=known)
+        chosen.ClearField("attributes")
+        chosen.attributes.extend(kept.attributes)
         return chosen
 
     def _rows(self, tracks: pb.Tracks) -> NDArray[np.bool_]:
@@ -112,15 +120,16 @@ class EventSelection:
 
     def _of(self, message: schemas.Events) -> schemas.Events:
         zones, kinds, classes = self._chosen.values()
-        events = tuple(
-            one
-            for one in message.events
+        rows = [
+            row
+            for row, one in enumerate(message.events)
             if (not zones or one.zone in zones)
             and (not kinds or one.kind in kinds)
             and (not classes or message.labels[one.label] in classes)
-        )
+        ]
+        events, known = tuple(message.events[row] for row in rows), schemas.attributes_of_rows(message.attributes, rows)
         counts = message.zones and tuple(one for one in message.zones if not zones or one.zone in zones)
-        return message.model_copy(update={"events": events, "zones": counts})
+        return message.model_copy(update={"events": events, "zones": counts, "attributes": known})
 
 
 def _inside(points: NDArray[np.float64], corners: NDArray[np.float64]) -> NDArray[np.bool_]:
