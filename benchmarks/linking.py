@@ -2,7 +2,11 @@
 
 Prints a table as Markdown: generated sites of two to eight streams with 100 objects (`tests/support/sites.py`), tracked
 by the tracker with the profile for unknown detectors. An object is common while two streams have a confirmed track of
-it. A link is right if both tracks are mostly of one object.
+it. A link is right if both tracks are mostly of one object; `while it held`, if they were in most frames in which they
+were linked: a track may go over to another object.
+
+With `--kitti DIR`, two detectors saw one drive: each is a stream, and the second one is at another place and time.
+Objects are those of the labels within `NEAR_M` of a detection.
 """
 
 from __future__ import annotations
@@ -13,24 +17,32 @@ import time
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "support"))
 
+from gaps import followed
 from optipmb_service.links.linker import Linker
 from optipmb_service.settings import LinkSettings
+from optipmb_tools.datasets import open_dataset
+from optipmb_tools.run.tracking import tracker_frame
 from sites import RATE, View, World, circle, copied, corridor, plaza, tracked
 
+import optipmb
+
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
     from optipmb_schemas import Tracks
 
 SOON = round(1.5 * RATE)
 VECTOR = 32
+DETECTORS = ("pvrcnn", "pointrcnn")
+LEAST_SCORE = 0.3
+NEAR_M = 2.0
 EVERY = LinkSettings(streams=("*/*/*",))
 
 
@@ -42,11 +54,12 @@ class Figures:
     soon: int = 0
     right: int = 0
     wrong: int = 0
+    held: int = 0
     late: list[int] = field(default_factory=list)
 
     def __iadd__(self, other: Figures) -> Self:
         """Add the counts of another run."""
-        for name in ("episodes", "soon", "right", "wrong"):
+        for name in ("episodes", "soon", "right", "wrong", "held"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
         return self
 
@@ -55,23 +68,34 @@ class Figures:
         links = self.right + self.wrong
         return (
             f"{self.soon} of {self.episodes} ({100 * self.soon / max(self.episodes, 1):.1f} %) | "
-            f"{self.right} of {links} ({100 * self.right / max(links, 1):.2f} %)"
+            f"{self.right} of {links} ({100 * self.right / max(links, 1):.2f} %) | "
+            f"{100 * self.held / max(links, 1):.2f} %"
         )
 
 
 Key = tuple[str, int]
 
 
-def owners(tracks: Sequence[Tracks], sources: Sequence[NDArray[np.int64]] | None) -> dict[Key, int]:
-    """Return the object that each track is mostly of."""
-    votes: dict[Key, Counter[int]] = defaultdict(Counter)
-    for n, one in enumerate(tracks):
-        for identity, row in zip(one.id.tolist(), one.detection.tolist(), strict=True):
-            if sources is None:
-                votes[one.stream, identity][identity] += 1
-            elif row >= 0:
-                votes[one.stream, identity][int(sources[n][row])] += 1
-    return {key: count.most_common(1)[0][0] for key, count in votes.items()}
+class Owners(NamedTuple):
+    """The object that each track is mostly of, and that of its newest detection after each frame."""
+
+    mostly: dict[Key, int]
+    newest: dict[tuple[str, int], dict[int, int]]
+
+    @classmethod
+    def of(cls, streams: Iterable[tuple[Sequence[Tracks], Sequence[NDArray[np.int64]]]]) -> Owners:
+        """Return the owners of tracks by the objects of the detections of each frame."""
+        votes: dict[Key, Counter[int]] = defaultdict(Counter)
+        newest: dict[tuple[str, int], dict[int, int]] = {}
+        for tracks, sources in streams:
+            known: dict[int, int] = {}
+            for one, source in zip(tracks, sources, strict=True):
+                for identity, row in zip(one.id.tolist(), one.detection.tolist(), strict=True):
+                    if row >= 0:
+                        known[identity] = int(source[row])
+                        votes[one.stream, identity][known[identity]] += 1
+                newest[one.stream, one.seq] = {n: known[n] for n in one.id.tolist() if n in known}
+        return cls({key: count.most_common(1)[0][0] for key, count in votes.items()}, newest)
 
 
 def linked(
@@ -90,10 +114,12 @@ def linked(
     return linker, after
 
 
-def judge(messages: Sequence[Tracks], after: Sequence[dict[Key, bytes]], owner: dict[Key, int]) -> Figures:  # noqa: C901 - a loop over messages and their pairs
+def judge(messages: Sequence[Tracks], after: Sequence[dict[Key, bytes]], owners: Owners) -> Figures:  # noqa: C901 - a loop over messages and their pairs
     """Count common objects that are linked soon, and the links of tracks that are seen at once."""
-    found, pairs = Figures(), {}
+    found, owner = Figures(), owners.mostly
+    pairs: dict[tuple[Key, Key], list[int]] = {}
     shown: dict[str, list[int]] = {}
+    newest: dict[str, dict[int, int]] = {}
     common: dict[tuple[int, str, str], int] = {}
     when: dict[tuple[int, str, str], int | None] = {}
     seen_at: dict[tuple[int, str, str], int] = {}
@@ -109,6 +135,7 @@ def judge(messages: Sequence[Tracks], after: Sequence[dict[Key, bytes]], owner: 
         frame = round((one.stamp_ns - begin_ns) * 1e-9 * RATE)
         sure = one.confirmed > 0 if one.confirmed is not None else np.ones(len(one.id), bool)
         shown[one.stream] = one.id[sure].tolist()
+        newest[one.stream] = owners.newest[one.stream, one.seq]
         mine = {owner.get((one.stream, n), -1): n for n in shown[one.stream]}
         ids = {state[one.stream, n]: n for n in shown[one.stream] if (one.stream, n) in state}
         for stream, tracks in shown.items():
@@ -116,8 +143,9 @@ def judge(messages: Sequence[Tracks], after: Sequence[dict[Key, bytes]], owner: 
                 continue
             for n in tracks:
                 if (mate := ids.get(state.get((stream, n), b""))) is not None:
-                    pair = (one.stream, mate, stream, n) if one.stream < stream else (stream, n, one.stream, mate)
-                    pairs[pair] = owner.get((one.stream, mate)) == owner.get((stream, n), -2)
+                    both = (one.stream, mate), (stream, n)
+                    held = pairs.setdefault((min(both), max(both)), [])
+                    held.append(newest[one.stream].get(mate, -1) == newest[stream].get(n, -2))
                 who = owner.get((stream, n), -1)
                 if who < 0 or who not in mine:
                     continue
@@ -132,8 +160,10 @@ def judge(messages: Sequence[Tracks], after: Sequence[dict[Key, bytes]], owner: 
             close(key)
     for key in list(common):
         close(key)
-    found.right = sum(pairs.values())
-    found.wrong = len(pairs) - found.right
+    real = {key: held for key, held in pairs.items() if all(owner.get(one, -1) >= 0 for one in key)}
+    found.right = sum(owner[one] == owner[other] for one, other in real)
+    found.wrong = len(real) - found.right
+    found.held = sum(2 * sum(held) > len(held) for held in real.values())
     return found
 
 
@@ -161,14 +191,10 @@ def overlap(
     """Link a plaza, whose second stream has another place, angle and clock."""
     world, views = plaza(seed, seconds), views_of(count)
     views[1] = replace(views[1], shift=shift, turn=turn, late=late)
-    messages, owner = [], {}
-    for view in views:
-        tracks, sources = tracked(world, view, seed)
-        messages.append(tracks)
-        owner |= owners(tracks, sources)
-    given = ordered(messages)
+    streams = [tracked(world, view, seed) for view in views]
+    given = ordered([tracks for tracks, _ in streams])
     linker, after = linked(EVERY, given)
-    return judge(given, after, owner), linker, _found(given, views) if late else []
+    return judge(given, after, Owners.of(streams)), linker, _found(given, views) if late else []
 
 
 def _found(messages: Sequence[Tracks], views: Sequence[View]) -> list[float]:
@@ -208,13 +234,10 @@ def passages(
         west[west[:, :, 0] > 0.0] = np.nan
         east[east[:, :, 0] < 20.0] = np.nan
         world = World(np.ones(2 * half, np.int64), np.concatenate((west[:, :half], east[:, :half]), axis=1))
-    messages, owner, sources = [], {}, {}
-    for view in views:
-        tracks, source = tracked(world, view, seed)
-        messages.append(tracks)
-        sources[view.stream] = source
-        owner |= owners(tracks, source)
-    given = ordered(messages)
+    streams = [tracked(world, view, seed) for view in views]
+    sources = {view.stream: source for view, (_, source) in zip(views, streams, strict=True)}
+    owner = Owners.of(streams).mostly
+    given = ordered([tracks for tracks, _ in streams])
     vectors = _vectors(given, sources, seed, equal_error) if equal_error else None
     sides = (("*/west/*", "*/east/*"), ("*/east/*", "*/west/*")) if declared else ()
     settings = LinkSettings(
@@ -279,6 +302,42 @@ def spread_of(equal_error: float) -> float:
     return middle
 
 
+def recorded(root: Path, name: str) -> Figures:
+    """Link the tracks of two detectors on one drive, of which the second one is off."""
+    wrong = View("site/b/lidar", circle(0.0, 0.0, np.inf), shift=(0.4, -0.3), turn=np.radians(1.0), late=0.1)
+    streams = []
+    for stream, detector in (("site/a/lidar", DETECTORS[0]), (wrong.stream, DETECTORS[1])):
+        (sequence,) = open_dataset("kitti", root, detector, clouds=0).sequences([name])
+        truth = sequence.truth()
+        if truth is None:
+            raise SystemExit(f"{root}: expected the labels of {name}, received none")
+        frames, sources = [], []
+        parameters = optipmb.generic_parameters(("Car",), 0.1)
+        for one in sequence.frames():
+            frame = tracker_frame(parameters, name, one.take(one.score >= LEAST_SCORE))
+            rows = np.flatnonzero(truth.frame == one.index)
+            far = np.hypot(*np.moveaxis(frame.center[:, None, :2] - truth.center[rows][:, :2], 2, 0))
+            nearest = far.argmin(axis=1) if len(rows) else np.zeros(0, np.int64)
+            near = far[np.arange(len(nearest)), nearest] < NEAR_M
+            sources.append(np.where(near, truth.id[rows][nearest], -1) if len(rows) else np.full(len(far), -1))
+            frames.append(frame)
+        found = []
+        for one in followed(frames, parameters).values():
+            changes: dict[str, object] = {"stream": stream}
+            if stream == wrong.stream:
+                place, cos, sin = one.center.copy(), np.cos(wrong.turn), np.sin(wrong.turn)
+                middle = frames[0].center[:, :2].mean(axis=0)
+                turn = np.array(((cos, sin), (-sin, cos)))
+                place[:, :2] = (place[:, :2] - middle) @ turn + middle + wrong.shift
+                changes |= {"center": place, "velocity": one.velocity @ turn}
+                changes |= {"stamp_ns": one.stamp_ns + round(1e9 * wrong.late)}
+            found.append(one.model_copy(update=changes))
+        streams.append((found, sources))
+    given = ordered([tracks for tracks, _ in streams])
+    _, after = linked(EVERY, given)
+    return judge(given, after, Owners.of(streams))
+
+
 def cost(seed: int) -> tuple[float, float, float]:
     """Return the share of a core for 20 streams at 10 Hz, the tracks of one, and bytes of state for each object."""
     world = plaza(seed, 20.0, objects=600, half=(150.0, 60.0))
@@ -307,8 +366,10 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--parts", nargs="*", default=["overlap", "bias", "passages", "door", "cost"])
     parser.add_argument("--every", type=float, default=60.0, help="mean time between two people in a corridor, s")
+    parser.add_argument("--kitti", type=Path, help="folder of KITTI tracking")
+    parser.add_argument("--sequences", nargs="*", default=["0003", "0007", "0020"])
     given = parser.parse_args()
-    print("| figure | seeds | linked | right |\n| --- | --- | --- | --- |")
+    print("| figure | seeds | linked | right | while it held |\n| --- | --- | --- | --- | --- |")
     for count in (2, 4, 8) if "overlap" in given.parts else ():
         total = Figures()
         for seed in given.seeds:
@@ -333,6 +394,8 @@ def main() -> None:
     if "door" in given.parts:
         right, wrong, _ = np.sum([passages(n, declared=False, door=True) for n in given.seeds], axis=0)
         print(f"| door with exits declared: wrong links | {given.seeds} | {right + wrong} | |", flush=True)
+    for name in given.sequences if given.kitti else ():
+        print(f"| two detectors on one drive, one off | {name} | {recorded(given.kitti, name)} |", flush=True)
     if "cost" in given.parts:
         share, tracks, size = cost(given.seeds[0])
         print(f"| share of a core, 20 streams of {tracks:.0f} tracks, 10 Hz | {given.seeds[:1]} | {share:.3f} | |")

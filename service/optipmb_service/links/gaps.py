@@ -197,8 +197,10 @@ def decide(
     ends: tuple[End, End, NDArray[np.bool_]],
     more: Array,
     stamp_ns: int,
-) -> tuple[Index, Array, Learned]:
+) -> tuple[Index, Array, NDArray[np.bool_], Learned]:
     """Return the row of the lost object of each beginning (Y,), -1 for a new one, its probability, and the examples.
+
+    After the probability comes whether it would be less than `min_probability` without appearance.
 
     Args:
         settings: of the area.
@@ -231,8 +233,9 @@ def decide(
             continue
         mouth = np.minimum(whole, rate * (area_m2(passage.to) + 2.0 * np.pi * KERNEL_M**2))
         odds = odds + way * DECLARED * _declared(passage, seconds) / mouth
-    odds = np.where(fits, odds * np.exp(more), 0.0)
-    odds = np.minimum(odds, MOST_ODDS)
+    alone = np.where(fits, odds, 0.0)
+    alone = alone / (1.0 + alone.sum(axis=0))
+    odds = np.minimum(np.where(fits, odds * np.exp(more), 0.0), MOST_ODDS)
     share = odds / (1.0 + odds.sum(axis=0))
     score = np.where(odds > 1.0, np.log(np.maximum(odds, 1e-300)), 0.0)
     before, after = np.nonzero(score > 0.0)
@@ -243,7 +246,8 @@ def decide(
         at = np.flatnonzero(taken & due[after])
         partner[after[at]], sure[after[at]] = before[at], 1.0 / (1.0 + np.exp(-margin[at]))
     partner[sure < settings.min_probability] = -1
-    return partner, sure, _learnt(learned, lost, young, share, seconds, due & ~new)
+    needed = alone[partner, np.arange(len(partner))] < settings.min_probability if len(before) else partner >= 0
+    return partner, sure, needed, _learnt(learned, lost, young, share, seconds, due & ~new)
 
 
 def _learnt(learned: Learned, lost: End, young: End, share: Array, seconds: Array, due: NDArray[np.bool_]) -> Learned:

@@ -83,13 +83,16 @@ class InputStream:
     used_ns: int = -1
     """Stamp of the newest message that counted."""
 
-    def at(self, stamp_ns: int) -> Look | None:
-        """Return the newest message until a time, and drop those before it."""
+    def until(self, stamp_ns: int) -> list[Look]:
+        """Return the newest fresh message until a time, after earlier ones with vectors; drop those before it."""
+        found = []
         while len(self.looks) > 1 and self.looks[1].stamp_ns <= stamp_ns:
-            self.looks.popleft()
-        if not self.looks or not stamp_ns - FRESH_NS < self.looks[0].stamp_ns <= stamp_ns:
-            return None
-        return self.looks[0]
+            look = self.looks.popleft()
+            if look.vectors is not None and look.stamp_ns > self.used_ns:
+                found.append(look)
+        if self.looks and self.looks[0].stamp_ns <= stamp_ns:
+            found.append(self.looks[0])
+        return [one for one in found if one.stamp_ns > stamp_ns - FRESH_NS]
 
     def add(self, look: Look) -> bool:
         """Add a message in the order of stamps; return whether the oldest was dropped for it."""
@@ -109,6 +112,7 @@ class LinkInputs:
         streams: by name.
         counters: messages and others that were left out, by reason.
         problems: present ones, by stream and code.
+        is_set_back: whether common times begin again.
 
     Args:
         frame: returns the world frame of a stream.
@@ -119,6 +123,7 @@ class LinkInputs:
         self.streams: dict[str, InputStream] = {}
         self.counters: collections.Counter[str] = collections.Counter()
         self.problems: dict[tuple[str, str], str] = {}
+        self.is_set_back = False
 
     def say(self, stream: str, code: str, text: str) -> None:
         """Note that something is wrong with a stream; empty: not any more."""
@@ -144,9 +149,19 @@ class LinkInputs:
                 return None
             stream = InputStream(message.stream, len(self.streams), self.frame(message.stream), offset_ns=offset)
             self.streams[message.stream] = stream
-        slack = (arrived_ns - stream.accepted_ns) // 10
-        stream.offset_ns = offset if stream.newest_ns < 0 else min(offset, stream.offset_ns + max(slack, 0))
-        if self._is_off(stream, arrived_ns) or not self._is_next(stream, message, arrived_ns, next_ns):
+        since = max(arrived_ns - stream.accepted_ns, 0)
+        if 0 <= stream.newest_ns and offset < stream.offset_ns - CLOCK_NS and since < STUCK_NS:
+            apart = stream.offset_ns - offset  # one stamp is not believed against those before
+            self.say(stream.name, "wrong_clock", f"a stamp is {apart * 1e-9:+.1f} s from those before")
+            return None
+        stream.offset_ns = offset if stream.newest_ns < 0 else min(offset, stream.offset_ns + since // 10)
+        reference = self._reference(arrived_ns, stream)
+        if self._is_off(stream, reference):
+            return None
+        if next_ns - GRID_NS > arrived_ns - reference + 2 * CLOCK_NS:
+            self._set_back()
+            stream.offset_ns, next_ns = offset, -1
+        if not self._is_next(stream, message, arrived_ns, next_ns):
             return None
         stream.newest_ns = max(stream.newest_ns, message.stamp_ns)
         stream.accepted_ns = arrived_ns
@@ -219,8 +234,19 @@ class LinkInputs:
             stream.looks.extend(Look(one[0], one[1], *map(unpack, one[2])) for one in looks)
             self.streams[name] = stream
 
-    def _is_off(self, stream: InputStream, arrived_ns: int) -> bool:
-        """Return whether the clock of a stream is far from most other clocks."""
+    def _set_back(self) -> None:
+        """Begin all streams again, for the common time is ahead of all clocks that agree.
+
+        A stream with a wrong clock was there before the others, or most clocks were set back.
+        """
+        for one in self.streams.values():
+            one.looks.clear()
+            one.newest_ns = one.used_ns = -1
+        self.is_set_back = True
+        self.say("", "set_back", "the clocks of most streams are behind those before: all links begin again")
+
+    def _reference(self, arrived_ns: int, stream: InputStream) -> int:
+        """Return the offset of most clocks; of as many, of those that are nearest to the receiver's."""
         others = [
             one.offset_ns
             for one in self.streams.values()
@@ -228,7 +254,10 @@ class LinkInputs:
         ]
         offsets = np.array(others)
         agree = (np.abs(offsets[:, None] - offsets) <= CLOCK_NS).sum(axis=1)
-        reference = int(offsets[agree.argmax()])
+        return int(offsets[np.lexsort((np.abs(offsets), -agree))[0]])
+
+    def _is_off(self, stream: InputStream, reference: int) -> bool:
+        """Return whether the clock of a stream is far from most other clocks."""
         apart = reference - stream.offset_ns
         is_off = abs(apart) > CLOCK_NS
         text = f"its stamps are {apart * 1e-9:+.1f} s from other streams" if is_off else ""
@@ -243,6 +272,7 @@ class LinkInputs:
         if late and stream.newest_ns >= 0 and arrived_ns - stream.accepted_ns > STUCK_NS:
             stream.looks.clear()
             stream.newest_ns = stream.used_ns = -1
+            stream.offset_ns = arrived_ns - stamp
             late = stamp <= next_ns - GRID_NS
         if late or any(one.stamp_ns == stamp for one in stream.looks):
             self.counters["late" if late else "repeated"] += 1

@@ -103,6 +103,8 @@ class Linker:
             vectors: (N, E) of appearance, NaN where unknown.
         """
         stream = self.inputs.accept(message, arrived_ns, self.grid_ns)
+        if self.inputs.is_set_back:
+            self._begin_again()
         if stream is None:
             return
         if message.session != stream.session:
@@ -165,9 +167,13 @@ class Linker:
         return int(size[size > 1].sum())
 
     def wrong(self) -> dict[tuple[str, str], str]:
-        """Return the present problems, by stream and code, with streams whose frames or clocks differ by much."""
+        """Return the present problems, by stream and code, with streams whose frames or clocks differ by much.
+
+        That common times began again is said once.
+        """
         names = {one.number: one.name for one in self.inputs.streams.values()}
         found = dict(self.inputs.problems)
+        self.inputs.say("", "set_back", "")
         for bias in self.biases[self.biases["pairs"] >= 1]:
             value, sigma = np.abs(bias["estimate"]), np.sqrt(np.diag(bias["covariance"]))
             far = (value > MISALIGNED) & (value > LEAST_SIGMAS * sigma)
@@ -207,18 +213,19 @@ class Linker:
         """Return the tracks at a common time, and update their objects."""
         found: list[tuple[Any, ...]] = []
         for stream in self.inputs.streams.values():
-            look = stream.at(stamp_ns)
-            if look is None:
+            looks = stream.until(stamp_ns)
+            for look in looks:
+                ahead = stamp_ns - look.stamp_ns
+                keep = np.flatnonzero(look.since_ns < FRESH_NS - ahead)
+                for old, new in self.objects.continued(look, keep):
+                    self._merge(old, new)
+                numbers = self.objects.numbers(stream, look, keep)
+                if look.stamp_ns > stream.used_ns:
+                    seen, rows = self.objects.update(look, keep, numbers)
+                    self._vectors.see(look, seen, rows, self.objects, self.pairs)
+                    stream.used_ns = look.stamp_ns
+            if not looks:
                 continue
-            ahead = stamp_ns - look.stamp_ns
-            keep = np.flatnonzero(look.since_ns < FRESH_NS - ahead)
-            for old, new in self.objects.continued(look, keep):
-                self._merge(old, new)
-            numbers = self.objects.numbers(stream, look, keep)
-            if look.stamp_ns > stream.used_ns:
-                seen, rows = self.objects.update(look, keep, numbers)
-                self._vectors.see(look, seen, rows, self.objects, self.pairs)
-                stream.used_ns = look.stamp_ns
             seconds = ahead * NS
             place = look.place[keep] + seconds * look.velocity[keep]
             more = seconds**2 * look.variance[keep] + (0.5 * ACCELERATION * seconds**2) ** 2
@@ -281,9 +288,9 @@ class Linker:
         begun = self.objects.ends(young, streams, begin=True)
         ends = self.objects.ends(lost, streams, begin=False), begun, due
         names = {number: one.name for number, one in streams.items()}
-        more, used = self._vectors.alike(own["number"][lost], own["number"][young], begun.kind)
+        more = self._vectors.alike(own["number"][lost], own["number"][young], begun.kind)
         found = gaps.decide(self.settings, names, self._learned, ends, more, stamp_ns)
-        partner, probability, self._learned = found
+        partner, probability, needed, self._learned = found
         own["decided"][young[due]] = 1
         at = np.flatnonzero(partner >= 0)
         if len(at) == 0:
@@ -291,10 +298,20 @@ class Linker:
         pairs = np.zeros(len(at), PAIR)
         pairs["a"], pairs["b"] = own["number"][lost[partner[at]]], own["number"][young[at]]
         pairs["stamp_ns"], pairs["probability"], pairs["linked"] = stamp_ns, probability[at], 1
-        pairs["how"] = np.where(used[partner[at], at], APPEARANCE, 1)
+        pairs["how"] = np.where(needed[at] & (more[partner[at], at] != 0.0), APPEARANCE, 1)
         self.pairs = np.concatenate((self.pairs, pairs))
         self.pairs = self.pairs[np.argsort(views.keys_of(self.pairs), kind="stable")]
         return True
+
+    def _begin_again(self) -> None:
+        """End all objects, for the next common time is before those of their tracks."""
+        own = self.objects.table
+        told = np.flatnonzero((own["told"] > 0) & (own["ended"] == 0)).tolist()
+        self._changes += [self._row(n).model_copy(update={"ended": True}) for n in told]
+        self.objects.drop(np.ones(len(own), np.bool_))
+        self.pairs, self.biases, self._learned = self.pairs[:0], self.biases[:0], Learned.empty()
+        self._vectors.sums.clear()
+        self._part, self.grid_ns, self.inputs.is_set_back = np.zeros(0, np.int64), -1, False
 
     def _settle(self) -> None:
         self._part, new = parts.settle(self.objects, self.pairs)

@@ -1,6 +1,7 @@
 """Appearance of the objects of an area: their vectors, and what a distance of two vectors says.
 
-Distances of vectors of one object, and of different ones, are counted from objects that are linked without vectors.
+Distances are counted as joining over gaps counts them: within a track, of different objects, and of one object in two
+views, which are objects that are sure without vectors.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 OTHERS: Final = 8
 """Other objects from which the distance of a vector is counted."""
+WITHIN, DIFFERENT, VIEWS = range(3)
 
 
 class ObjectVectors:
@@ -34,15 +36,18 @@ class ObjectVectors:
 
     Attributes:
         sums: when the newest vector of an object came, and their sum, by number.
-        counts: distances by kind, of one object or different ones, and distance.
+        counts: distances by kind, of `WITHIN`, `DIFFERENT` and `VIEWS`, and distance.
     """
 
     def __init__(self) -> None:
         self.sums: dict[int, tuple[int, NDArray[np.float32]]] = {}
-        self.counts = np.zeros((len(KINDS), 2, DISTANCES))
+        self.counts = np.zeros((len(KINDS), 3, DISTANCES))
 
     def see(self, look: Look, numbers: Index, rows: Index, objects: Objects, pairs: Table) -> None:
-        """Add the vectors of rows of a message to objects, and count distances."""
+        """Add the vectors of rows of a message to objects, and count distances.
+
+        Others than an object are those that are there at once, and, once it is linked, all that it is not linked to.
+        """
         if look.vectors is None:
             return
         fresh = [n for n, row in enumerate(rows.tolist()) if not np.isnan(look.vectors[row, 0])]
@@ -52,18 +57,20 @@ class ObjectVectors:
         alive = own["number"][own["ended"] == 0].tolist()
         for number, vector in vectors.items():
             kind = int(own["kind"][objects.at(np.array(number))])
-            linked = {number, *partners.get(number, ())}
-            others = [one for one in alive if one in self.sums and one not in linked][-OTHERS:]
-            self._count(kind, 0, vector, partners.get(number, ()))
-            self._count(kind, 1, vector, others)
+            views = partners.get(number, ())
+            linked = {number, *views, *(one for other in views for one in partners[other])}
+            known = self.sums if views else [one for one in alive if one in self.sums]
+            self._count(kind, WITHIN, vector, (number,))
+            self._count(kind, DIFFERENT, vector, [one for one in known if one not in linked][-OTHERS:])
+            self._count(kind, VIEWS, vector, views)
         for number, vector in vectors.items():
             total = vector / np.linalg.norm(vector)
             if (old := self.sums.get(number)) is not None and len(old[1]) == len(vector):
                 total = total + old[1] * np.float32(0.9)
             self.sums[number] = look.stamp_ns, total.astype(np.float32)
 
-    def alike(self, lost: Index, young: Index, kind: Index) -> tuple[Array, NDArray[np.bool_]]:
-        """Return what vectors say of pairs (L, Y) of objects, and of which they say something."""
+    def alike(self, lost: Index, young: Index, kind: Index) -> Array:
+        """Return what vectors say of pairs (L, Y) of objects."""
         more = np.zeros((len(lost), len(young)))
         for m, number in enumerate(young.tolist()):
             if (own := self.sums.get(number)) is None:
@@ -72,7 +79,7 @@ class ObjectVectors:
                 if (old := self.sums.get(other)) is not None and len(old[1]) == len(own[1]):
                     both = Vectors(np.array([number]), own[1][None], np.array([other]), old[1][None], self.counts)
                     more[n, m] = appearance_score(both, other, number, int(kind[m]))
-        return more, more != 0.0
+        return more
 
     def _count(self, kind: int, which: int, vector: NDArray[np.float32], others: Iterable[int]) -> None:
         for other in others:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from optipmb_schemas import Tracks
+from optipmb_schemas import Tracks, decode, encode, encoding_of
 from optipmb_service.links.linker import Linker
 from optipmb_service.links.places import WorldFrame
 from optipmb_service.settings import LinkSettings
@@ -135,6 +135,85 @@ def test_wrong_clock(off_s: float, site: tuple[World, list[Tracks]]) -> None:
             linker.take(third[n // 2], one.stamp_ns)
     assert ids(linker) == ids(run(messages))
     assert "stamps are" in linker.inputs.problems["site/wrong/lidar", "wrong_clock"]
+
+
+@pytest.mark.parametrize("off_s", [-3600.0, 3600.0, 4e9])
+def test_wrong_clock_is_there_first(off_s: float, site: tuple[World, list[Tracks]]) -> None:
+    """A stream with a wrong clock that is there before the others does not keep them from being linked."""
+    world, messages = site
+    wrong = copied(world, View("site/wrong/lidar", circle(0.0, 0.0, 40.0)), 3)
+    linker = area()
+    for n, one in enumerate(wrong):
+        stamp_ns = one.stamp_ns + round(off_s * 1e9)
+        linker.take(one.model_copy(update={"stamp_ns": stamp_ns}), one.stamp_ns)
+        for other in messages[2 * n : 2 * n + 2] if n >= 10 else ():
+            linker.take(other, one.stamp_ns)
+    found = ids(linker)
+    assert all(found["site/west/lidar", n] == found["site/east/lidar", n] for n in common(world))
+    assert ("site/wrong/lidar", "wrong_clock") in linker.inputs.problems
+
+
+def test_one_wrong_stamp(site: tuple[World, list[Tracks]]) -> None:
+    """One stamp that is far ahead is left out, named, and changes no link."""
+    world, messages = site
+    linker = run(messages[:120])
+    odd = messages[120].model_copy(update={"stamp_ns": 2**62})
+    linker.take(odd, messages[120].stamp_ns)
+    assert (odd.stream, "wrong_clock") in linker.inputs.problems
+    run(messages[121:], linker)
+    found = ids(linker)
+    assert all(found["site/west/lidar", n] == found["site/east/lidar", n] for n in common(world))
+
+
+@pytest.mark.parametrize("seconds", [13, 20])
+def test_clocks_set_back(seconds: int, site: tuple[World, list[Tracks]]) -> None:
+    """Streams whose clocks are all set back are linked again, after their earlier objects have ended."""
+    world, messages = site
+    linker = run(messages)
+    before = {row.global_id for row in linker.rows() if not row.ended}
+    linker.changes()
+    later = seconds * 10**9
+    for one in messages:
+        earlier = one.model_copy(update={"stamp_ns": one.stamp_ns - 3600 * 10**9, "session": "2" * 32})
+        linker.take(earlier, one.stamp_ns + later)
+    found, ended = ids(linker), {row.global_id for row in linker.changes() if row.ended}
+    assert all(found["site/west/lidar", n] == found["site/east/lidar", n] for n in common(world))
+    assert ended >= before
+    assert [("", "set_back") in linker.wrong() for _ in range(2)] == [True, False]
+
+
+def test_swapped_frames(site: tuple[World, list[Tracks]]) -> None:
+    """World frames that were taken for each other link nobody."""
+    _, messages = site
+    frames = {"site/west/lidar": WorldFrame(0, 30.0, -20.0, 1.5), "site/east/lidar": WorldFrame(0, -10.0, 25.0, -0.7)}
+    assert run(messages, area(frames.__getitem__)).rows() == []
+
+
+def hostile(n: int) -> dict[str, Any]:
+    """Return columns at the bounds of `Tracks`."""
+    far = np.array([[1e9, -1e9, 0.0], [0.0, 0.0, 0.0], [5.0, 5.0, 0.0]])
+    return (
+        {"center": far, "velocity": np.full((3, 2), 1e5)},
+        {"covariance": np.zeros((3, 6, 6)), "time_since_detection": np.full(3, 1e12)},
+        {"covariance": np.full((3, 6, 6), -1e30), "age": np.full(3, 1e12)},
+        {"covariance": np.full((3, 6, 6), 1e30), "size": np.full((3, 3), 1e-300)},
+        {"object": np.array([2**53 - 1, 0, 1]), "object_probability": np.ones(3)},
+        {"object": np.array([7, 7, -1]), "object_probability": np.ones(3)},
+        {"labels": [f"c{k}" for k in range(200)], "label": np.array([0, 100, 199])},
+    )[n % 7]
+
+
+def test_hostile_values(site: tuple[World, list[Tracks]]) -> None:
+    """Tracks with all values at their bounds change no link of other streams; the state stays readable."""
+    world, messages = site
+    linker = area()
+    for n, one in enumerate(messages):
+        linker.take(one, one.stamp_ns)
+        odd = tracks_message("site/odd/lidar", n, [0, 1, 2**62], stamp_ns=one.stamp_ns, confirmed=1, **hostile(n // 10))
+        linker.take(decode(encode(odd), Tracks, encoding=encoding_of(odd)), one.stamp_ns)
+    found = ids(linker)
+    assert all(found["site/west/lidar", n] == found["site/east/lidar", n] for n in common(world))
+    assert again(linker.state()).rows() == linker.rows()
 
 
 def test_parting() -> None:
