@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from optipmb_client.incoming import Arrival
     from optipmb_client.zenoh.handles import Query
 
+    from optipmb_service.cluster.store import LeaseStore
     from optipmb_service.settings import LinkSettings, Settings
     from optipmb_service.zenoh.client import Client
 
@@ -54,6 +55,8 @@ VECTORS: Final = 64
 VECTOR_S: Final = 1.0
 """Least time between two vectors of a stream."""
 REACH_S: Final = 10.0
+"""Longest wait for the store, and for its record of an area."""
+PAUSE_S: Final = 0.1
 
 
 class LinkedArea:
@@ -163,6 +166,7 @@ class LinkBridge(Component):
         self.messages: Counter[str] = Counter()
         self.reporter = ProblemReporter(client.publish_problem)
         self._store, self._why = open_store(settings, None)
+        _reach(self._store)
         self.areas = [LinkedArea(name, settings, client, self._store) for name in settings.links]
         self._vectors: dict[str, OrderedDict[tuple[bytes, int], Any]] = {}
         self._begun = time.monotonic()
@@ -296,6 +300,24 @@ class LinkBridge(Component):
         detected = np.flatnonzero((tracks.detection >= 0) & (tracks.detection < len(found[1])))
         rows[detected] = found[1][tracks.detection[detected]]
         return rows
+
+
+def _reach(store: LeaseStore) -> None:
+    """Wait for a store that connects in the background.
+
+    Raises:
+        StoreError: it cannot be reached.
+    """
+    until = time.monotonic() + REACH_S
+    while True:
+        try:
+            store.get("link")
+        except StoreError:
+            if time.monotonic() > until:
+                raise
+            time.sleep(PAUSE_S)
+        else:
+            return
 
 
 def _whole(pattern: str) -> str:

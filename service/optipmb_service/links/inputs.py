@@ -150,7 +150,7 @@ class LinkInputs:
             stream = InputStream(message.stream, len(self.streams), self.frame(message.stream), offset_ns=offset)
             self.streams[message.stream] = stream
         since = max(arrived_ns - stream.accepted_ns, 0)
-        if 0 <= stream.newest_ns and offset < stream.offset_ns - CLOCK_NS and since < STUCK_NS:
+        if stream.newest_ns >= 0 and offset < stream.offset_ns - CLOCK_NS and since < STUCK_NS:
             apart = stream.offset_ns - offset  # one stamp is not believed against those before
             self.say(stream.name, "wrong_clock", f"a stamp is {apart * 1e-9:+.1f} s from those before")
             return None

@@ -282,6 +282,40 @@ def test_passages_are_learned(planes: int, walks: list[Tracks]) -> None:
     assert len(by_id) >= (15 if planes == 0 else 5)
 
 
+def test_vectors_tell_people_apart() -> None:
+    """People who come back elsewhere, in another order, are linked by vectors that overlapping views have taught."""
+    rng, people = np.random.default_rng(2), 6
+    vectors = np.random.default_rng(1).standard_normal((people, 32))
+    lanes = np.column_stack((np.zeros(people), 6.0 * np.arange(people), np.ones(people)))
+    passage = {"from": "*/*/*", "to": "site/west/*", "s": (4.0, 20.0)}
+    linker = area(embedding_model="reid", min_probability=0.9, passages=(passage,))
+
+    def look(stream: str, n: int, first: int, place: np.ndarray, looks: np.ndarray) -> None:
+        message = tracks_message(
+            stream,
+            n,
+            list(range(first, first + len(place))),
+            stamp_ns=BEGIN_NS + n * 10**8,
+            center=place + 0.05 * rng.standard_normal(place.shape),
+            covariance=0.01 * np.eye(6),
+            age=0.1 * (n - 480 * (first > 0)),
+            labels=["pedestrian"],
+            confirmed=1,
+        )
+        noise = 0.1 * rng.standard_normal((len(place), 32))
+        linker.take(message, message.stamp_ns, (looks[: len(place)] + noise).astype(np.float32) if n % 5 == 0 else None)
+
+    for n in range(560):
+        back = n >= 480
+        west = lanes + np.array((12.0, 3.0, 0.0)) if back else lanes[: people * (n < 400)]
+        look("site/west/lidar", n, 10 * back, west, vectors[::-1] if back else vectors)
+        look("site/east/lidar", n, 0, lanes[: people * (n < 400)], vectors)
+    found = {(row.object, row.kind): row.global_id for row in linker.rows() if row.stream == "site/west/lidar"}
+    again = [number for number, kind in found if kind == "appearance"]
+    assert len(again) >= people // 2
+    assert all(found[number, "appearance"] == found[10 + people - 1 - number, "overlap"] for number in again)
+
+
 def test_exit(walks: list[Tracks]) -> None:
     """Nothing that ended at an exit comes back anywhere."""
     door = {"streams": "a/*/*", "polygon": ((-4.0, -5.0), (2.0, -5.0), (2.0, 5.0), (-4.0, 5.0))}

@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from gateway import GatewayProcess
+from nats_process import NatsProcess
 from optipmb_client import Connection, Publisher, Subscriber, linked_objects
 from optipmb_client.errors import ServiceUnavailable
 from optipmb_client.grpc import GrpcConnection
+from optipmb_client.sessions import links_of
 from optipmb_schemas import Keys, Links, Tracks, decode, encode, encoding_of
 from optipmb_tools.cli import run
 from optipmb_tools.run.service_process import free_port
@@ -20,6 +22,8 @@ from service_process import ServiceProcess
 from tracks_message import tracks_message
 
 STREAMS = ("west/node/lidar", "east/node/lidar")
+CLUSTERED = ("north/node/lidar", "south/node/lidar")
+PEOPLE = ("left/node/camera", "right/node/lidar")
 OBJECTS = 6
 HTTP = f"127.0.0.1:{free_port()}"
 BEGIN_NS = 1_700_000_000_000_000_000
@@ -47,16 +51,15 @@ def settings(tmp_path: Path) -> Path:
     return file
 
 
-def link(services: ServiceProcess, settings: Path) -> ServiceProcess:
-    return ServiceProcess(
-        "link",
-        "--settings",
-        str(settings),
-        "--connect",
-        services.endpoint,
-        listen=False,
-        environment={"OPTIPMB_STORE": str(settings.parent)},
-    )
+def of_sites(settings: Path, west: str, east: str) -> None:
+    """Have the settings link other sites, whose streams no other test has sent."""
+    settings.write_text(settings.read_text().replace("west", west).replace("east", east))
+
+
+def link(services: ServiceProcess, settings: Path, nats: str = "") -> ServiceProcess:
+    store = {"OPTIPMB_CLUSTER": nats} if nats else {"OPTIPMB_STORE": str(settings.parent)}
+    options = ("link", "--settings", str(settings), "--connect", services.endpoint)
+    return ServiceProcess(*options, listen=False, environment=store)
 
 
 def send(publishers: list[Publisher], frames: range) -> None:
@@ -90,6 +93,25 @@ def until_linked(connection: Connection) -> dict[tuple[str, str, int], bytes]:
     return found
 
 
+def test_killed_with_a_cluster(services: ServiceProcess, settings: Path, tmp_path: Path) -> None:
+    """With NATS, links survive a kill on a machine that keeps nothing."""
+    of_sites(settings, "north", "south")
+    with Connection(services.endpoint) as connection, NatsProcess(tmp_path) as nats:
+        publishers = [Publisher(one, frame="world", connection=connection) for one in CLUSTERED]
+        with link(services, settings, nats.url) as process:
+            process.wait_ready()
+            send(publishers, range(40))
+            before = until_linked(connection)
+            time.sleep(2.0)  # it is saved once a second
+            process.end(signal.SIGKILL)
+        for publisher in publishers:
+            publisher.close()  # and with it what it had published
+        with link(services, settings, nats.url) as process:
+            process.wait_ready()
+            assert until_linked(connection) == before
+            assert process.end()[0] == 0
+
+
 def test_killed_and_started_again(services: ServiceProcess, settings: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Links survive a kill; a consumer counts the objects of two streams once each; other readers get the same ids."""
     with Connection(services.endpoint) as connection, Subscriber("*/*/*", connection=connection) as subscriber:
@@ -117,7 +139,8 @@ def test_killed_and_started_again(services: ServiceProcess, settings: Path, caps
                 with GrpcConnection((gateway.address,)) as remote:
                     assert linked_objects(remote, "campus") == ids
             with urllib.request.urlopen(f"http://{HTTP}/api/v1/tracks?stream=*/*/*") as answer:
-                read = [one["global_id"] for frame in json.load(answer) for one in frame["objects"]]
+                frames = [one for one in json.load(answer) if one["stream"] in STREAMS]
+            read = [one["global_id"] for frame in frames for one in frame["objects"]]
             assert sorted(read) == sorted(one.hex() for one in ids.values())
             assert run(["links", "campus", "--connect", services.endpoint]) == 0
             lines = capsys.readouterr().out.splitlines()
@@ -131,6 +154,56 @@ def test_killed_and_started_again(services: ServiceProcess, settings: Path, caps
     assert all(len(one) <= 80 for one in lines)
     assert f"{OBJECTS} objects of campus" in lines[-1]
     assert sum("west/node/lidar" in one and "east/node/lidar" in one for one in lines) == OBJECTS
+
+
+def looks(publisher: Publisher, frames: range, place: np.ndarray, vectors: np.ndarray) -> None:
+    """Publish objects at places (F, N, 2) with the vectors of a model."""
+    rng = np.random.default_rng(frames.start)
+    for frame, centre in zip(frames, place, strict=True):
+        count = len(centre)
+        publisher.publish(
+            stamp_ns=BEGIN_NS + frame * 100_000_000,
+            labels=("pedestrian",),
+            label=np.zeros(count, np.int64),
+            center=np.column_stack((centre, np.ones(count))),
+            size=np.tile((0.6, 0.6, 1.7), (count, 1)),
+            yaw=np.zeros(count),
+            score=np.full(count, 0.9),
+            embedding=(vectors[:count] + 0.1 * rng.standard_normal((count, vectors.shape[1]))).astype(np.float32),
+            embedding_model="reid",
+        )
+
+
+def test_vectors(services: ServiceProcess, settings: Path) -> None:
+    """People who change places out of sight are linked by vectors, whose distances overlapping views have taught."""
+    of_sites(settings, "left", "right")
+    more = (
+        'embedding_model = "reid"\nmin_probability = 0.8\npassages = [{from = "*/*/*", to = "left/*/*", s = [4, 20]}]\n'
+    )
+    settings.write_text(settings.read_text().replace("[links.campus.frames]", f"{more}[links.campus.frames]"))
+    vectors = np.random.default_rng(1).standard_normal((OBJECTS, 32))
+    still = np.column_stack((np.zeros(OBJECTS), 6.0 * np.arange(OBJECTS)))
+    elsewhere = still[None] + (12.0, 3.0)
+    with Connection(services.endpoint) as connection, link(services, settings) as process:
+        process.wait_ready()
+        west, east = (Publisher(one, frame="world", connection=connection) for one in PEOPLE)
+        for frame in range(400):
+            for publisher, place in ((west, still), (east, (100.0, 0.0) - still)):
+                looks(publisher, range(frame, frame + 1), place[None], vectors)
+            time.sleep(0.01)
+        for frame in range(400, 700):  # west sees nobody any more, then all of them elsewhere, in another order
+            order = vectors[::-1] if frame >= 480 else vectors
+            looks(west, range(frame, frame + 1), elsewhere if frame >= 480 else still[None, :0], order)
+            looks(east, range(frame, frame + 1), still[None, :0], vectors)
+            time.sleep(0.01)
+        ends, found = time.monotonic() + PATIENCE_S, []
+        while len(found) < OBJECTS // 2 and time.monotonic() < ends:
+            found = [one for one in links_of(connection, "campus").objects if one.kind == "appearance"]
+            time.sleep(0.1)
+        for publisher in (west, east):
+            publisher.close()
+        assert process.end()[0] == 0
+    assert len({one.global_id for one in found}) >= OBJECTS // 2
 
 
 def test_hostile_tracks(services: ServiceProcess, settings: Path) -> None:
