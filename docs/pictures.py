@@ -15,11 +15,15 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Polygon, Rectangle
+from optipmb_service.links.linker import Linker
+from optipmb_service.links.places import WorldFrame
+from optipmb_service.settings import LinkSettings
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.run import profiles
 from optipmb_tools.run.rejoining import RejoinOptions, tracklets
 from optipmb_tools.run.tracking import track_whole
+from sites import View, circle, copied, plaza
 
 import optipmb
 from optipmb.joining.evidence import motion_of, motion_score
@@ -29,6 +33,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 CAR, GHOST, TRUTH, TRACK = "#0072B2", "#D55E00", "#B5B5B5", "#0072B2"
+LINKED = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#8C6D1F", "#00487A", "#93400A", "#006B4E")
 RATE = 10
 FRAMES = 70
 MISSED = range(30, 40)
@@ -384,6 +389,47 @@ STANDS_M = 2.0
 """Places of a parked car lie nearer together."""
 
 
+def draw_links(figure: Figure) -> None:
+    """Draw the tracks of two sites with frames of their own, and in one plane with the common ids."""
+    world = plaza(11, 10.0, objects=10, half=(26.0, 14.0))
+    views = View("garage/n/lidar", circle(-10.0, 0.0, 20.0)), View("yard/n/lidar", circle(10.0, 0.0, 20.0))
+    frames = {"garage": WorldFrame(), "yard": WorldFrame(0, 30.0, -6.0, np.pi / 2)}
+    linker = Linker("campus", LinkSettings(streams=("*/*/*",)), lambda stream: frames[stream.partition("/")[0]])
+    streams = [
+        [one.model_copy(update={"id": one.id + 20 * number}) for one in copied(world, view, 1)]
+        for number, view in enumerate(views)
+    ]
+    paths: dict[tuple[str, int], list[np.ndarray]] = {}
+    for together in zip(*streams, strict=True):
+        for one in together:
+            frame = frames[one.stream.partition("/")[0]]
+            back = frame._replace(yaw=-frame.yaw)
+            own = back.turned(one.center[:, :2] - (frame.x, frame.y))
+            moved = {"center": np.column_stack((own, one.center[:, 2])), "velocity": back.turned(one.velocity)}
+            linker.take(one.model_copy(update=moved), one.stamp_ns)
+            for identity, place in zip(one.id.tolist(), own, strict=True):
+                paths.setdefault((one.stream, identity), []).append(place)
+    ids = {(row.stream, row.object): row.global_id.hex()[:4] for row in linker.rows()}
+    known = sorted(set(ids.values()))
+    garage, yard, both = figure.subplots(1, 3, width_ratios=(1.0, 0.8, 1.5))
+    for (stream, identity), places in paths.items():
+        name = ids.get((stream, identity))
+        colour = TRUTH if name is None else LINKED[known.index(name) % len(LINKED)]
+        frame = frames[stream.partition("/")[0]]
+        own, side = np.array(places), yard if stream.startswith("yard") else garage
+        common = frame.turned(own) + np.array((frame.x, frame.y))
+        side.plot(*own.T, color=colour, linewidth=1.2)
+        side.annotate(str(identity), own[-1], fontsize=8, color="#333333")
+        both.plot(*common.T, color=colour, linewidth=1.2, linestyle="--" if side is yard else "-")
+        if name and side is garage:
+            both.annotate(name, common[-1], fontsize=8, color="#333333")
+    for axes, text in ((garage, "garage"), (yard, "yard: its own world frame"), (both, "one plane, common ids")):
+        axes.set_title(text, fontsize=10)
+        axes.set(aspect="equal", xlabel="x (m)")
+        axes.grid(visible=True, color="#EEEEEE")
+    garage.set_ylabel("y (m)")
+
+
 def main(folder: Path) -> None:
     """Write the pictures into a folder."""
     draw_runs(folder)
@@ -411,6 +457,10 @@ def main(folder: Path) -> None:
     FigureCanvasAgg(figure)
     draw_camera(figure)
     figure.savefig(folder / "cameras.png", dpi=100, metadata={"Software": None})
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    draw_links(figure)
+    figure.savefig(folder / "links.png", dpi=100, metadata={"Software": None})
     for name, size in (("track", (6.0, 4.2)), ("ellipse", (6.0, 4.2)), ("existence", (6.0, 3.0))):
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)
