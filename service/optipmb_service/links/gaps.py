@@ -142,6 +142,8 @@ def _moved(lost: End, young: End, gap_s: float) -> Array:
         end_variance=rows.variance,
         yaw=unknown[:, 0],
         size=rows.size,
+        candidate=np.full(total, -1),
+        candidate_probability=unknown[:, 0],
     ).words
     before, after = np.divmod(np.arange(count * many), many)
     scores = pair_scores(words, before, count + after, MOTION.kind, MOTION.motion, gap_s).reshape(count, many)
