@@ -49,8 +49,8 @@ test -s "$work/out/0000.txt"
 
 # At a release the two packages share no file: one can be removed, and the other still imports.
 "$bin/python" -m build --outdir "$work/release" "$root" >/dev/null
-"$bin/python" -m pip --python "$work/venv/bin/python" install --quiet --no-deps --force-reinstall \
-  "$work"/release/optipmb-*-none-any.whl "$node"
+"$bin/python" -m pip --python "$work/venv/bin/python" uninstall --quiet --yes optipmb
+"$bin/python" -m pip --python "$work/venv/bin/python" install --quiet --no-deps "$work"/release/optipmb-*-none-any.whl "$node"
 "$work/venv/bin/python" -c 'import optipmb_tools, optipmb_client'
 "$bin/python" -m pip --python "$work/venv/bin/python" check --disable-pip-version-check
 "$bin/python" -m pip --python "$work/venv/bin/python" uninstall --quiet --yes optipmb
