@@ -388,6 +388,14 @@ def test_a_recording_that_begins_late_is_known() -> None:
     assert (one.begins_late, one.never_tracked) == (True, 1)
 
 
+@pytest.mark.parametrize(("tracked", "missed"), [((), 0), ((3,), 0), ((3, 4), 0), ((2, 5), 2), ((1, 3, 6), 3)])
+def test_frames_between_tracked_ones_count_as_never_tracked(tracked: tuple[int, ...], missed: int) -> None:
+    """Frames before the first and after the last one with tracks do not."""
+    messages = [recorded(detections(n), 1 + n) for n in range(8)]
+    (one,) = plan([*messages, *(recorded(tracks(n, [1]), 10 + n) for n in tracked)]).values()
+    assert one.never_tracked == missed
+
+
 def test_a_recording_is_a_dataset(tmp_path: Path) -> None:
     """Frames, poses, labels and clouds equal the messages; the profile is the recorded one."""
     path = tmp_path / "a.mcap"

@@ -91,7 +91,7 @@ def test_a_service_that_does_not_answer_is_named(
         with Connection(endpoint) as connection:
             while len(connection.alive(Keys().all_alive())) < 2 and time.monotonic() < deadline:
                 pass
-        assert run(["status", "--connect", endpoint, "--timeout", "0.1"]) == 0
+        assert run(["status", "--connect", endpoint, "--timeout", "1"]) == 0  # the router answers within it
         token.undeclare()
     shown = capsys.readouterr()
     assert "slow is alive and does not answer" in shown.err

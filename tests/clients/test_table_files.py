@@ -341,6 +341,15 @@ def test_a_folder_reads_its_tables_and_no_notes(tmp_path: Path) -> None:
     assert [one.name for one in open_dataset("table", tmp_path / "many").sequences(["all"])] == ["a"]
 
 
+def test_a_column_that_is_text_in_one_frame_is_text(tmp_path: Path) -> None:
+    """Classes of a folder with a table for each frame are read as those of one table would be."""
+    for i, labels in enumerate((["Car"], [7, 7, 8])):
+        rows = [f"{k + 1},2,0,4,2,1.5,0.1,0.9,{label}\n" for k, label in enumerate(labels)]
+        (tmp_path / f"{i:06d}.csv").write_text("x,y,z,length,width,height,yaw,score,label\n" + "".join(rows))
+    (sequence,) = open_dataset("table", tmp_path, rate="10").sequences(["all"])
+    assert [one.labels[n] for one in sequence.frames() for n in one.label] == ["Car", "7", "7", "8"]
+
+
 @pytest.mark.parametrize("name", ["x.json", "x.xlsx", "x.csv.gz", "x.txt"])
 @pytest.mark.parametrize("command", ["track", "replay"])
 def test_results_are_refused_in_an_unknown_format_before_tracking(

@@ -85,46 +85,46 @@ class Program(AbstractContextManager["Program"]):
                 self._came.notify_all()
 
 
-@pytest.mark.parametrize("time", [1, 2])
-def test_the_examples_work_twice(service: ServiceProcess, time: int) -> None:
+def test_the_examples_work_twice(service: ServiceProcess) -> None:
     """Readers of the examples and the pages print the promised lines of the published car, also with kept state."""
     texts = [(EXAMPLES / f"{name}.py").read_text() for name in ("subscriber", "publisher")]
     assert all(text.count(DEFAULT_ENDPOINT) == 1 for text in texts), "an example names the endpoint, once"
     subscriber, publisher = (connected(text, service.endpoint) for text in texts)
-    with (
-        Program(subscriber.replace("timeout=5", "timeout=100")) as tracks,
-        Program(connected(block("zones.md", "python"), service.endpoint)) as events,
-        Program(connected(block("fixed-rate.md", "python"), service.endpoint)) as outputs,
-    ):
-        for one in (tracks, events, outputs):
-            one.until("listens")
-        with Program(publisher) as car:
-            assert car.process.wait(200) == 0
-        rows = [line.split() for line in tracks.until(r".* at (4[89]|5\d)\.")[1:]]
-        said = [line.split() for line in events.until(f"yard left .* {time}$")[1:]]
-        predicted = outputs.until(r"frame 4\d")[1:]
-    assert len(rows) >= 45
-    assert {tuple(row[:4]) for row in rows} == {("garage/robot-1/lidar", "track", rows[0][2], "car")}
-    x = [float(row[5]) for row in rows]
-    assert x == sorted(x)
-    # A reader of events first gets the kept ones.
     promised = (REPOSITORY / "docs/zones.md").read_text().partition("It prints:\n\n```\n")[2].partition("```")[0]
-    assert [one[:-2] for one in said] == time * [line.split()[:-2] for line in promised.splitlines()]
-    assert [one[-1] for one in said[-4:]] == 4 * [str(time)]
-    assert all(re.fullmatch(r"frame \d+, -?\d+ ms later: x = \[.*\]", line) for line in predicted)
+    for time in (1, 2):
+        with (
+            Program(subscriber.replace("timeout=5", "timeout=100")) as tracks,
+            Program(connected(block("zones.md", "python"), service.endpoint)) as events,
+            Program(connected(block("fixed-rate.md", "python"), service.endpoint)) as outputs,
+        ):
+            for one in (tracks, events, outputs):
+                one.until("listens")
+            with Program(publisher) as car:
+                assert car.process.wait(200) == 0
+            rows = [line.split() for line in tracks.until(r".* at (4[89]|5\d)\.")[1:]]
+            said = [line.split() for line in events.until(f"yard left .* {time}$")[1:]]
+            predicted = outputs.until(r"frame 4\d")[1:]
+        assert len(rows) >= 45
+        assert {tuple(row[:4]) for row in rows} == {("garage/robot-1/lidar", "track", rows[0][2], "car")}
+        x = [float(row[5]) for row in rows]
+        assert x == sorted(x)
+        # A reader of events first gets the kept ones.
+        assert [one[:-2] for one in said] == time * [line.split()[:-2] for line in promised.splitlines()]
+        assert [one[-1] for one in said[-4:]] == 4 * [str(time)]
+        assert all(re.fullmatch(r"frame \d+, -?\d+ ms later: x = \[.*\]", line) for line in predicted)
 
 
-@pytest.mark.parametrize("time", [1, 2])
-def test_two_sensors_work_twice(fused: ServiceProcess, time: int) -> None:
+def test_two_sensors_work_twice(fused: ServiceProcess) -> None:
     """The radar goes on with the track and the box of the lidar, and does so again with the state that is left."""
-    with Program(connected(block("fusion.md", "python"), fused.endpoint)) as program:
-        lines = program.until(r"radar: track \d+ at 58\.")
-    if time == 1:
-        promised = (REPOSITORY / "docs/fusion.md").read_text().partition("for each frame with a track:\n\n```\n")[2]
-        assert lines[1:3] == promised.splitlines()[:2]
-        assert lines[-1] == promised.splitlines()[3]
-    assert len({line.split()[2] for line in lines[-20:]}) == 1
-    assert all(line.endswith("4.5 m long, heading 0.0") for line in lines[-20:])
+    for time in (1, 2):
+        with Program(connected(block("fusion.md", "python"), fused.endpoint)) as program:
+            lines = program.until(r"radar: track \d+ at 58\.")
+        if time == 1:
+            promised = (REPOSITORY / "docs/fusion.md").read_text().partition("for each frame with a track:\n\n```\n")[2]
+            assert lines[1:3] == promised.splitlines()[:2]
+            assert lines[-1] == promised.splitlines()[3]
+        assert len({line.split()[2] for line in lines[-20:]}) == 1
+        assert all(line.endswith("4.5 m long, heading 0.0") for line in lines[-20:])
 
 
 def test_the_examples_are_short() -> None:

@@ -66,9 +66,19 @@ def publishing(stream: str, label: str, length: float) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
     with browser(tmp_path_factory.mktemp("profile")) as found:
         yield found
+
+
+@pytest.fixture
+def chrome(shared: Chrome) -> Chrome:
+    """The browser, without the page, size and messages of an earlier test."""
+    shared.get("about:blank")
+    size(shared, 1280, 800)
+    console(shared)
+    requested(shared)
+    return shared
 
 
 def test_the_page_shows_live_tracks_and_survives_a_restart(chrome: Chrome, tmp_path: Path) -> None:
@@ -77,12 +87,9 @@ def test_the_page_shows_live_tracks_and_survives_a_restart(chrome: Chrome, tmp_p
     Live tracks of the chosen stream, drawn where they are; figures at a tap; nothing in the
     console, nothing from elsewhere; after a restart of the service it goes on by itself.
     """
-    size(chrome, 1280, 800)
     with service() as first:
         first.wait_ready()
         with publishing(CARS, "car", 4.0), publishing(WALKERS, "pedestrian", 1.0):
-            chrome.get("about:blank")
-            requested(chrome)  # forgets the browser's own start page
             chrome.get(BASE)
             wait(chrome, "at('streams').rows.length === 2 && frame !== null && frame.tracks.length === 3")
             wait(chrome, "at('state').textContent === 'ready'")
@@ -174,7 +181,6 @@ def test_the_page_takes_a_token_and_shows_zones(chrome: Chrome, tmp_path: Path) 
     (tmp_path / "tokens.json").write_text(json.dumps({hashlib.sha256(b"secret").hexdigest(): "viewer/map"}))
     environment = {"OPTIPMB_HTTP_TOKENS": str(tmp_path / "tokens.json")}
     options = ("--listen", ENDPOINT, "--http", HTTP, "--settings", str(tmp_path / "zones.toml"))
-    size(chrome, 1280, 800)
     with ServiceProcess(*options, listen=False, environment=environment) as process:
         process.wait_ready()
         with publishing(CARS, "car", 4.0):

@@ -441,3 +441,14 @@ def test_the_health_command() -> None:
     gone = health("--http", address)
     assert (gone.returncode, gone.stdout) == (1, f"no answer at {address}: [Errno 111] Connection refused\n")
     assert health().returncode == 2
+
+
+def test_a_server_that_ends_later_than_it_may_ends_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its thread, which nobody waits for any more, still has its socket: else it would end with an exception."""
+    one = Server(application(Watched(), Settings(), None), "127.0.0.1:0", 1000)
+    threads = [thread for thread in threading.enumerate() if thread.name == "http"]
+    monkeypatch.setattr(server, "GRACE_S", 0)
+    one.close()
+    for thread in threads:
+        thread.join(60)
+    assert not any(thread.is_alive() for thread in threads)

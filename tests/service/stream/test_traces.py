@@ -44,7 +44,9 @@ class Traced(Around):
         provider = TracerProvider(shutdown_on_exit=False)
         provider.add_span_processor(SimpleSpanProcessor(self.exporter))
         self.traces = Traces("test", provider)
-        self.streams = streams_of(self, traces=self.traces)
+        self.streams = streams_of(
+            self, traces=self.traces, cloud_wait_s=60
+        )  # for clouds that come late on a busy machine
 
     def publish(self, payload: bytes, attachment: bytes | None = None) -> None:  # type: ignore[override]  # as the service calls it
         self.published.append((payload, attached(attachment)))

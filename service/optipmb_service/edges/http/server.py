@@ -267,7 +267,8 @@ class Server:
         """End the server; answers under way have a second. May be called twice."""
         self._server.should_exit = True
         self._thread.join(2 * GRACE_S)
-        self._socket.close()
+        if not self._thread.is_alive():  # else it closes the socket itself, and would fail without one
+            self._socket.close()
 
 
 class _Loop(asyncio.SelectorEventLoop):
