@@ -135,7 +135,7 @@ class Detections(_message.Message):
     embedding: Array
     embedding_model: str
     attributes: _containers.RepeatedCompositeFieldContainer[Attribute]
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame: _Optional[_Union[Frame, str]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., labels: _Optional[_Iterable[str]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., has_points: _Optional[bool] = ..., field_of_view: _Optional[_Union[FieldOfView, _Mapping]] = ..., position_covariance: _Optional[_Union[Array, _Mapping]] = ..., embedding: _Optional[_Union[Array, _Mapping]] = ..., embedding_model: _Optional[str] = ..., attributes: _Optional[_Iterable[_Union[Attribute, _Mapping]]] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., frame: _Optional[_Union[Frame, str]] = ..., pose: _Optional[_Union[Pose, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., labels: _Optional[_Iterable[str]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., has_points: bool = ..., field_of_view: _Optional[_Union[FieldOfView, _Mapping]] = ..., position_covariance: _Optional[_Union[Array, _Mapping]] = ..., embedding: _Optional[_Union[Array, _Mapping]] = ..., embedding_model: _Optional[str] = ..., attributes: _Optional[_Iterable[_Union[Attribute, _Mapping]]] = ...) -> None: ...
 
 class Points(_message.Message):
     __slots__ = ("stream", "epoch", "seq", "stamp_ns", "frame", "pose", "relocation", "xyz")
@@ -263,7 +263,7 @@ class Tracks(_message.Message):
     path_covariance: Array
     relocation: Relocation
     delivery: Delivery
-    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: _Optional[bool] = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., world: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., predicted_to_ns: _Optional[int] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., measured: _Optional[_Union[Array, _Mapping]] = ..., class_probability: _Optional[_Union[Array, _Mapping]] = ..., object: _Optional[_Union[Array, _Mapping]] = ..., object_probability: _Optional[_Union[Array, _Mapping]] = ..., attributes: _Optional[_Iterable[_Union[Attribute, _Mapping]]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., epoch: _Optional[bytes] = ..., seq: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., sensor: _Optional[str] = ..., session: _Optional[str] = ..., revision: _Optional[int] = ..., profile: _Optional[str] = ..., cloud_used: bool = ..., gap: _Optional[int] = ..., ignored: _Optional[int] = ..., world: _Optional[int] = ..., labels: _Optional[_Iterable[str]] = ..., predicted_to_ns: _Optional[int] = ..., id: _Optional[_Union[Array, _Mapping]] = ..., label: _Optional[_Union[Array, _Mapping]] = ..., center: _Optional[_Union[Array, _Mapping]] = ..., size: _Optional[_Union[Array, _Mapping]] = ..., yaw: _Optional[_Union[Array, _Mapping]] = ..., heading_confidence: _Optional[_Union[Array, _Mapping]] = ..., velocity: _Optional[_Union[Array, _Mapping]] = ..., yaw_rate: _Optional[_Union[Array, _Mapping]] = ..., acceleration: _Optional[_Union[Array, _Mapping]] = ..., existence: _Optional[_Union[Array, _Mapping]] = ..., score: _Optional[_Union[Array, _Mapping]] = ..., covariance: _Optional[_Union[Array, _Mapping]] = ..., age: _Optional[_Union[Array, _Mapping]] = ..., time_since_detection: _Optional[_Union[Array, _Mapping]] = ..., detection: _Optional[_Union[Array, _Mapping]] = ..., confirmed: _Optional[_Union[Array, _Mapping]] = ..., measured: _Optional[_Union[Array, _Mapping]] = ..., class_probability: _Optional[_Union[Array, _Mapping]] = ..., object: _Optional[_Union[Array, _Mapping]] = ..., object_probability: _Optional[_Union[Array, _Mapping]] = ..., attributes: _Optional[_Iterable[_Union[Attribute, _Mapping]]] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., path_position: _Optional[_Union[Array, _Mapping]] = ..., path_yaw: _Optional[_Union[Array, _Mapping]] = ..., path_covariance: _Optional[_Union[Array, _Mapping]] = ..., relocation: _Optional[_Union[Relocation, _Mapping]] = ..., delivery: _Optional[_Union[Delivery, _Mapping]] = ...) -> None: ...
 
 class ZoneEvent(_message.Message):
     __slots__ = ("zone", "kind", "n", "id", "label", "at_ns", "position", "speed", "yaw", "how", "dwell_s", "direction", "object")
@@ -453,7 +453,7 @@ class SessionParameters(_message.Message):
     values: _struct_pb2.Struct
     sensors: _struct_pb2.Struct
     session: str
-    def __init__(self, profile: _Optional[str] = ..., cloud_wait_s: _Optional[float] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., restart: _Optional[bool] = ..., values: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., sensors: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., session: _Optional[str] = ...) -> None: ...
+    def __init__(self, profile: _Optional[str] = ..., cloud_wait_s: _Optional[float] = ..., horizons: _Optional[_Union[Array, _Mapping]] = ..., restart: bool = ..., values: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., sensors: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., session: _Optional[str] = ...) -> None: ...
 
 class SessionSummary(_message.Message):
     __slots__ = ("stream", "profile", "state", "rate_hz", "latency_p50_ms", "latency_p99_ms", "frames", "refused", "shed", "gaps", "tracks", "queue", "age_s", "worker", "sensors", "silent", "late", "duplicates", "configured", "learned", "rejoined", "lost_objects", "lost_dropped", "embedding_ignored")
@@ -557,7 +557,7 @@ class Acknowledgement(_message.Message):
     detections: int
     points: int
     points_wanted: bool
-    def __init__(self, detections: _Optional[int] = ..., points: _Optional[int] = ..., points_wanted: _Optional[bool] = ...) -> None: ...
+    def __init__(self, detections: _Optional[int] = ..., points: _Optional[int] = ..., points_wanted: bool = ...) -> None: ...
 
 class PublishResponse(_message.Message):
     __slots__ = ("acknowledgement", "problem", "skipped")
@@ -589,7 +589,7 @@ class TrackFilter(_message.Message):
     min_existence: float
     area: Polygon
     fields: _containers.RepeatedScalarFieldContainer[str]
-    def __init__(self, classes: _Optional[_Iterable[str]] = ..., confirmed_only: _Optional[bool] = ..., min_existence: _Optional[float] = ..., area: _Optional[_Union[Polygon, _Mapping]] = ..., fields: _Optional[_Iterable[str]] = ...) -> None: ...
+    def __init__(self, classes: _Optional[_Iterable[str]] = ..., confirmed_only: bool = ..., min_existence: _Optional[float] = ..., area: _Optional[_Union[Polygon, _Mapping]] = ..., fields: _Optional[_Iterable[str]] = ...) -> None: ...
 
 class SubscribeRequest(_message.Message):
     __slots__ = ("pattern", "filter", "max_rate_hz", "queue", "history", "problems", "predict")
@@ -607,7 +607,7 @@ class SubscribeRequest(_message.Message):
     history: bool
     problems: bool
     predict: bool
-    def __init__(self, pattern: _Optional[str] = ..., filter: _Optional[_Union[TrackFilter, _Mapping]] = ..., max_rate_hz: _Optional[float] = ..., queue: _Optional[int] = ..., history: _Optional[bool] = ..., problems: _Optional[bool] = ..., predict: _Optional[bool] = ...) -> None: ...
+    def __init__(self, pattern: _Optional[str] = ..., filter: _Optional[_Union[TrackFilter, _Mapping]] = ..., max_rate_hz: _Optional[float] = ..., queue: _Optional[int] = ..., history: bool = ..., problems: bool = ..., predict: bool = ...) -> None: ...
 
 class SubscribeResponse(_message.Message):
     __slots__ = ("tracks", "problem", "skipped")
@@ -633,7 +633,7 @@ class SubscribeEventsRequest(_message.Message):
     classes: _containers.RepeatedScalarFieldContainer[str]
     final: bool
     history: bool
-    def __init__(self, pattern: _Optional[str] = ..., zones: _Optional[_Iterable[str]] = ..., kinds: _Optional[_Iterable[str]] = ..., classes: _Optional[_Iterable[str]] = ..., final: _Optional[bool] = ..., history: _Optional[bool] = ...) -> None: ...
+    def __init__(self, pattern: _Optional[str] = ..., zones: _Optional[_Iterable[str]] = ..., kinds: _Optional[_Iterable[str]] = ..., classes: _Optional[_Iterable[str]] = ..., final: bool = ..., history: bool = ...) -> None: ...
 
 class SubscribeEventsResponse(_message.Message):
     __slots__ = ("events", "skipped")
@@ -671,7 +671,7 @@ class LinkedObject(_message.Message):
     probability: float
     kind: str
     ended: bool
-    def __init__(self, global_id: _Optional[bytes] = ..., stream: _Optional[str] = ..., session: _Optional[str] = ..., object: _Optional[int] = ..., probability: _Optional[float] = ..., kind: _Optional[str] = ..., ended: _Optional[bool] = ...) -> None: ...
+    def __init__(self, global_id: _Optional[bytes] = ..., stream: _Optional[str] = ..., session: _Optional[str] = ..., object: _Optional[int] = ..., probability: _Optional[float] = ..., kind: _Optional[str] = ..., ended: bool = ...) -> None: ...
 
 class Links(_message.Message):
     __slots__ = ("area", "revision", "stamp_ns", "whole", "objects")
@@ -685,7 +685,7 @@ class Links(_message.Message):
     stamp_ns: int
     whole: bool
     objects: _containers.RepeatedCompositeFieldContainer[LinkedObject]
-    def __init__(self, area: _Optional[str] = ..., revision: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., whole: _Optional[bool] = ..., objects: _Optional[_Iterable[_Union[LinkedObject, _Mapping]]] = ...) -> None: ...
+    def __init__(self, area: _Optional[str] = ..., revision: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., whole: bool = ..., objects: _Optional[_Iterable[_Union[LinkedObject, _Mapping]]] = ...) -> None: ...
 
 class GetLinksRequest(_message.Message):
     __slots__ = ("area",)
@@ -705,7 +705,7 @@ class ResetRequest(_message.Message):
     CLOSE_FIELD_NUMBER: _ClassVar[int]
     stream: str
     close: bool
-    def __init__(self, stream: _Optional[str] = ..., close: _Optional[bool] = ...) -> None: ...
+    def __init__(self, stream: _Optional[str] = ..., close: bool = ...) -> None: ...
 
 class ResetResponse(_message.Message):
     __slots__ = ("state",)

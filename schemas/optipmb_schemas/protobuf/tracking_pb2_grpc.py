@@ -6,7 +6,7 @@ import warnings
 
 from optipmb_schemas.protobuf import tracking_pb2 as optipmb_dot_v1_dot_tracking__pb2
 
-GRPC_GENERATED_VERSION = '1.85.1'
+GRPC_GENERATED_VERSION = '1.78.2'
 GRPC_VERSION = grpc.__version__
 _version_not_supported = False
 
@@ -26,7 +26,7 @@ if _version_not_supported:
     )
 
 
-class TrackingServiceStub:
+class TrackingServiceStub(object):
     """The tracking service. Errors carry `google.rpc.BadRequest` details: the path of the field, what was expected there and
     what was received.
     """
@@ -89,7 +89,7 @@ class TrackingServiceStub:
                 _registered_method=True)
 
 
-class TrackingServiceServicer:
+class TrackingServiceServicer(object):
     """The tracking service. Errors carry `google.rpc.BadRequest` details: the path of the field, what was expected there and
     what was received.
     """
@@ -227,7 +227,7 @@ def add_TrackingServiceServicer_to_server(servicer, server):
 
 
  # This class is part of an EXPERIMENTAL API.
-class TrackingService:
+class TrackingService(object):
     """The tracking service. Errors carry `google.rpc.BadRequest` details: the path of the field, what was expected there and
     what was received.
     """
