@@ -201,7 +201,7 @@ def _evaluated(
     every: bool,
     by: "By",
 ) -> _Evaluated:
-    from optipmb_tools.commands.tables import figure_tables  # noqa: PLC0415  as above
+    from optipmb_tools.commands.tables import figure_tables, shown_table  # noqa: PLC0415  as above
     from optipmb_tools.evaluation import evaluate_files  # noqa: PLC0415  as above
     from optipmb_tools.evaluation.evaluate import (  # noqa: PLC0415  as above
         Evaluation,
@@ -231,7 +231,8 @@ def _evaluated(
     by_class = {one.name: {**protocol.parts.get(one.name, {}), **one.summary()} for one in figures}
     average = class_average(figures) if protocol.overall else None
     overall = {"overall": {**protocol.overall, "hota_centre": average}} if average is not None else {}
-    tables = (*protocol.tables, *figure_tables(figures, how.cutoff, average, every=every))
+    first = shown_table(figures) if how.distance is None and opened.name in {"kitti", "nuscenes"} else ()
+    tables = (*first, *protocol.tables, *figure_tables(figures, how.cutoff, average, every=every))
     return _Evaluated({**overall, "classes": by_class}, figures, tables)
 
 

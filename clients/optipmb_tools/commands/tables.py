@@ -46,6 +46,16 @@ def clear_table(results: "Sequence[ClassResult]", *, metres: bool, every: bool) 
     return _titled("Confirmed tracks; those from the score on that gives the highest MOTA", table)
 
 
+def shown_table(figures: "Sequence[ClassFigures]") -> Iterator[RenderableType]:
+    """Yield the CLEAR MOT figures of the confirmed tracks, where the files tell them; MOTP is in metres."""
+    table = _empty(("class", *_CLEAR))
+    for one in figures:
+        if one.clear is not None:
+            table.add_row(one.name, *_cells(one.clear.summary(), _CLEAR, metres=True))
+    if table.row_count:
+        yield _titled("Confirmed tracks, which people see; an object within 2 m is found", table)
+
+
 def _named_sets(confirmed: T | None, everything: T, best: T | None, least: float, *, every: bool) -> dict[str, T]:
     """Return the sets of tracks that have a row: confirmed tracks, tracks from a score on, and all if asked."""
     sets = {"confirmed": confirmed, f"≥ {least:.3f}": best, "all": everything if every or confirmed is None else None}

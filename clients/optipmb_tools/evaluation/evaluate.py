@@ -135,6 +135,7 @@ class ClassFigures:
     calibration: CalibrationResult | None  # where the tracks were kept with all columns
     errors: ErrorResult | None  # likewise
     velocity_error: float  # mean error of velocities, m/s; NaN where none are known
+    clear: ClearResult | None  # of the confirmed tracks, matched by centres in the plane
 
     @property
     def shown(self) -> TrackFigures:
@@ -152,6 +153,7 @@ class ClassFigures:
             "velocity_error": defined(self.velocity_error),
             "calibration": self.calibration.summary() if self.calibration else None,
             "errors": self.errors.summary() if self.errors else None,
+            "clear_centre": self.clear.summary() if self.clear else None,
         }
 
 
@@ -274,6 +276,7 @@ def evaluate_figures(
             calibration=evaluate_calibration([part[1:] for part in whole], name, near) if whole else None,
             errors=evaluate_errors(whole, name, near) if whole else None,
             velocity_error=float(errors.mean()) if len(errors) else np.nan,
+            clear=combine(clear(case, near) for case in cases(near, shown=True)) if told else None,
         )
 
     return [of_class(name) for name in names if name in present]

@@ -68,7 +68,7 @@ def test_a_covariance_that_no_message_can_carry_is_not_published() -> None:
 
 def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> schemas.Tracks:
     return convert.tracks_of(
-        optipmb.StepResult(None, found, None, paths),  # type: ignore[arg-type]  # of the tracks alone
+        optipmb.StepResult(optipmb.Density.empty(NUSCENES.labels), found, None, paths),  # type: ignore[arg-type]
         SENSOR.stream,
         FrameId(SENSOR.epoch, 1, 2),
         session="0" * 32,
