@@ -18,6 +18,7 @@ import numpy as np
 import optipmb_schemas as schemas
 import structlog
 
+import optipmb
 from optipmb import Georeference
 from optipmb_service.app.storage import open_store
 from optipmb_service.cluster.store import Fenced, StoreError, Write, load_newest
@@ -160,6 +161,7 @@ class LinkBridge(Component):
     """
 
     def __init__(self, settings: Settings, client: Client) -> None:
+        optipmb.warm_up(rejoin=True)  # before the first message, whose areas would not answer while kernels compile
         super().__init__(client)
         self._client, self._instance = client, settings.instance
         self._limits = settings.limits.limits()
