@@ -11,7 +11,7 @@ import codecs
 import io
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import chain
 from pathlib import Path
@@ -631,20 +631,44 @@ def to_arrow(columns: Mapping[str, NDArray[Any]]) -> "pa.Table":
     return pa.table({name: pa.array(values, from_pandas=values.dtype.kind == "f") for name, values in columns.items()})
 
 
-def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+def joined(blocks: Iterable[Columns]) -> Columns:
+    """Return the columns of blocks of rows, one below the other."""
+    parts: dict[str, list[NDArray[Any]]] = {}
+    for block in blocks:
+        for name, values in block.items():
+            parts.setdefault(name, []).append(values)
+    return {name: np.concatenate(parts.pop(name)) for name in list(parts)}
+
+
+def write_table(path: Path, columns: Columns) -> None:
+    """Write a table as `write_blocks` does."""
+    write_blocks(path, lambda: [columns])
+
+
+def write_blocks(path: Path, blocks: Callable[[], Iterable[Columns]]) -> None:
     """Write a table in the format that its name says; it appears complete, or not at all. NaN is written as no value.
+
+    Args:
+        path: The file.
+        blocks: Gives the rows in blocks with the same columns; of CSV no more than one is in memory.
 
     Raises:
         DatasetError: The name says no format that can be written.
         ClientError: pyarrow is not installed.
     """
+    pa = _pyarrow()
     kind = path.suffix.lower()
-    if kind in {".jsonl", ".ndjson"}:  # dates as text
-        columns = {name: one.astype(np.str_) if one.dtype.kind == "M" else one for name, one in columns.items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     if kind in {".csv", ".tsv"}:
-        write_whole(path, _csv_parts(columns, "\t" if kind == ".tsv" else ","))
+        separator = "\t" if kind == ".tsv" else ","
+        try:
+            write_whole(path, _csv_parts(blocks(), separator, "none"))
+        except pa.ArrowInvalid:  # a text has a separator, a quote or the end of a line
+            write_whole(path, _csv_parts(blocks(), separator, "needed"))
         return
+    columns = joined(blocks())
+    if kind in {".jsonl", ".ndjson"}:  # dates as text
+        columns = {name: one.astype(np.str_) if one.dtype.kind == "M" else one for name, one in columns.items()}
     table = to_arrow(columns)
     content: Any = io.BytesIO()
     if kind in {".jsonl", ".ndjson"}:
@@ -662,22 +686,18 @@ def write_table(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
     write_whole(path, content.getbuffer())
 
 
-def _csv_parts(columns: Mapping[str, NDArray[Any]], separator: str) -> Iterator[str | bytes]:
+def _csv_parts(blocks: Iterable[Columns], separator: str, style: str) -> Iterator[str | bytes]:
     """Yield the line of names, and the rows in parts: the text of a long table is never in memory as a whole."""
-    _pyarrow()
     from pyarrow import csv  # noqa: PLC0415  packages of an extra
 
-    texts = [values for values in columns.values() if values.dtype.kind == "U"]
-    special = any(mark in text for one in texts for text in unique_texts(one)[0] for mark in (separator, '"', "\n"))
-    style = "needed" if special else "none"  # "needed" quotes every text
-    yield (
-        separator.join(f'"{name}"' if special else name for name in columns) + "\n"
-    )  # releases of pyarrow differ in it
     options = csv.WriteOptions(include_header=False, delimiter=separator, quoting_style=style)
-    for start in range(0, len(next(iter(columns.values()), ())), _ROWS):
-        part = io.BytesIO()
-        csv.write_csv(to_arrow({name: one[start : start + _ROWS] for name, one in columns.items()}), part, options)
-        yield part.getvalue()
+    for number, columns in enumerate(blocks):
+        if number == 0:  # releases of pyarrow differ in the line of names; "needed" quotes every text
+            yield separator.join(f'"{name}"' if style == "needed" else name for name in columns) + "\n"
+        for start in range(0, len(next(iter(columns.values()), ())), _ROWS):
+            part = io.BytesIO()
+            csv.write_csv(to_arrow({name: one[start : start + _ROWS] for name, one in columns.items()}), part, options)
+            yield part.getvalue()
 
 
 def frame_files(folder: Path) -> list[Path]:

@@ -1,18 +1,23 @@
 """Tracking in process: repeatable files, classes, profiles, and refused input."""
 
+import weakref
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from optipmb_client.errors import UsageError
 from optipmb_schemas import PATHS
 from optipmb_tools.datasets import Dataset, Preloaded, open_dataset, selected_frames
 from optipmb_tools.evaluation.tracks import read_tracks
-from optipmb_tools.results.output import track_columns
+from optipmb_tools.results.output import Results, track_columns
 from optipmb_tools.run.profiles import read_profile
 from optipmb_tools.run.spool import BLOCK, SpooledTracks
 from optipmb_tools.run.tracking import Tracking, decided, track, track_whole
+from optipmb_tools.table_files import Columns, joined, write_table
 
 from optipmb.learning.hindsight import with_hindsight
 
@@ -146,6 +151,36 @@ def test_spooled_tracks_are_those_that_were_added(dataset: Dataset) -> None:
     changed = spooled.with_columns({"score": score})
     for index in (count - 1, BLOCK, 3):
         assert changed[index].score.tolist() == (0.5 * spooled[index].score).tolist()
-    table = track_columns("a", changed)
+    table = joined(track_columns("a", changed))
     assert table["id"].tolist() == [number for one in spooled.values() for number in one.id.tolist()]
     assert table["frame"].tolist() == [k for k, one in spooled.items() for _ in one.id]
+
+
+def test_rows_of_a_table_are_in_memory_block_by_block(dataset: Dataset, tmp_path: Path) -> None:
+    """Texts that need quotes, and other types in a later recording, give the table of all rows at once."""
+    loaded = Preloaded(dataset.sequences(["0000"])[0])
+    blocks = [
+        {"sequence": np.array(["b"]), "id": np.array([3.5])},
+        {"sequence": np.array(["a"]), "id": np.array([1])},
+        {"sequence": np.array(["a, the end"]), "id": np.array([2])},
+    ]
+    results = Results(dataset, tmp_path / "t.csv")
+    alive: list[weakref.ref[NDArray[Any]]] = []
+
+    def given(*numbers: int) -> Iterator[Columns]:
+        for number in numbers:
+            assert sum(one() is not None for one in alive) <= 1
+            values = blocks[number]["id"].copy()
+            alive.append(weakref.ref(values))
+            yield blocks[number] | {"id": values}
+            del values
+
+    for name, numbers in (("b", (0,)), ("a", (1, 2))):
+        loaded.name = name
+        assert results.take(loaded, given(*numbers))
+    assert not any(one() is not None for one in alive)
+    results.close([loaded])
+    text = (tmp_path / "t.csv").read_text()
+    assert text == '"sequence","id"\n"a",1\n"a, the end",2\n"b",3.5\n'
+    write_table(tmp_path / "whole.csv", joined([blocks[1], blocks[2], blocks[0]]))
+    assert (tmp_path / "whole.csv").read_text() == text

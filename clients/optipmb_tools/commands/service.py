@@ -119,7 +119,7 @@ def tracks(
     if out is not None:
         from optipmb_tools.results.output import track_columns, write_tracks  # noqa: PLC0415  only with --out
 
-        write_tracks(out, track_columns(stream, dict(enumerate(found)), georeference=georeference), digits)
+        write_tracks(out, lambda: track_columns(stream, dict(enumerate(found)), georeference=georeference), digits)
     stamps = [found[0].stamp_ns, found[-1].stamp_ns] if found else []
     text = f"{stream}: no tracks are kept of this time"
     if found:

@@ -12,7 +12,8 @@ request the upper triangle of the covariance of (x, y, v, phi, omega, a) follows
 seconds, radians; in text with the decimals of `DECIMALS`. The same tracks always give the same bytes.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
@@ -26,7 +27,8 @@ from optipmb_tools.files import remove_unfinished
 from optipmb_tools.geometry import Floats, Ints
 from optipmb_tools.results import full_path, stacked, write_full
 from optipmb_tools.results.exports import is_features, is_openlabel, write_features
-from optipmb_tools.table_files import Columns, is_table, is_text, write_table
+from optipmb_tools.spool import Spool
+from optipmb_tools.table_files import Columns, is_table, is_text, joined, write_blocks
 
 if TYPE_CHECKING:
     from optipmb_tools.datasets.interface import DataSequence, Dataset, Georeference
@@ -58,8 +60,8 @@ def track_columns(
     full: bool = False,
     georeference: "Georeference | None" = None,
     objects: "Objects | None" = None,
-) -> Columns:
-    """Return tracks (world frame) by frame index as columns, with `full` also the covariance.
+) -> Iterator[Columns]:
+    """Yield tracks (world frame) by frame index as columns, in blocks of rows; with `full` also the covariance.
 
     Args:
         name: Value of the column `sequence`.
@@ -70,15 +72,11 @@ def track_columns(
         objects: Which object each track is of; adds `object` and `object_probability`.
     """
     order = sorted(tracks)
-    more: dict[str, Any] = {"full": full, "georeference": georeference, "objects": objects}
-    blocks: dict[str, list[NDArray[Any]]] = {}
+    joined = bool(order) and all(tracks[index].object is not None for index in order)  # of a service that joins tracks
+    more: dict[str, Any] = {"full": full, "georeference": georeference, "objects": objects, "joined": joined}
     for start in range(0, max(len(order), 1), _BLOCK):  # of a long recording not all messages are in memory
         block = {index: tracks[index] for index in order[start : start + _BLOCK]}
-        for column, values in _columns_of(name, block, sequence, **more).items():
-            blocks.setdefault(column, []).append(values)
-    last = max(map(len, blocks.values()))  # a block without `object` is one of frames without it
-    blocks = {column: parts for column, parts in blocks.items() if len(parts) == last}
-    return {column: np.concatenate(blocks.pop(column)) for column in list(blocks)}
+        yield _columns_of(name, block, sequence, **more)
 
 
 def _columns_of(
@@ -89,8 +87,9 @@ def _columns_of(
     full: bool,
     georeference: "Georeference | None",
     objects: "Objects | None",
+    joined: bool,
 ) -> Columns:
-    """Return the columns of some frames; arguments as for `track_columns`."""
+    """Return the columns of some frames; arguments as for `track_columns`, and whether all frames have `object`."""
     order, parts = list(tracks), list(tracks.values())
     frame = np.repeat(np.array(order, dtype=np.int64), [len(one.id) for one in parts])
     stamps = np.repeat(np.array([one.stamp_ns for one in parts], dtype=np.int64), [len(one.id) for one in parts])
@@ -123,7 +122,7 @@ def _columns_of(
     columns["detection_row"] = np.concatenate([np.empty(0), *detections])
     if objects is not None:
         columns |= objects.columns(columns["id"], stamps)
-    elif parts and all(one.object is not None for one in parts):  # of a service that joins tracks
+    elif joined:
         columns |= {name: stacked(parts, name) for name in ("object", "object_probability")}
     if georeference is not None:
         columns |= georeference.to_geographic(stacked(parts, "center"), columns["yaw"])._asdict()
@@ -133,16 +132,18 @@ def _columns_of(
     return columns
 
 
-def write_tracks(path: Path, columns: Columns, digits: str) -> None:
-    """Write columns of tracks as a table; numbers in text have the decimals of `DECIMALS`, with `FULL` all digits.
+def write_tracks(path: Path, blocks: Callable[[], Iterable[Columns]], digits: str) -> None:
+    """Write blocks of rows of tracks as a table; numbers in text have the decimals of `DECIMALS`, with `FULL` all."""
+    write_blocks(path, blocks if digits == FULL or not is_text(path) else lambda: map(_rounded, blocks()))
 
-    Numbers are rounded in place, as a copy of a long table would double its memory.
-    """
-    for name, values in columns.items() if digits != FULL and is_text(path) else ():
-        if name in DECIMALS and values.dtype.kind == "f":
-            np.round(values, DECIMALS[name], out=values)
-            values += 0.0  # noqa: PLW2901  in place; -0 becomes 0
-    write_table(path, columns)
+
+def _rounded(columns: Columns) -> Columns:
+    return {
+        name: np.round(values, DECIMALS[name]) + 0.0  # -0 becomes 0
+        if name in DECIMALS and values.dtype.kind == "f"
+        else values
+        for name, values in columns.items()
+    }
 
 
 @dataclass(frozen=True)
@@ -243,20 +244,20 @@ class Results:
         self._submission = "submission" in dict(dataset.arguments.options)
         self._features = is_features(out)
         self._table = self._features or (is_table(out) and not out.is_dir())
-        self._taken: dict[str, Path | Columns] = {}
+        self._blocks = Spool()  # of the rows of a table
+        self._taken: dict[str, Path | list[int]] = {}  # file, or places of its blocks
 
     def write(
         self, sequence: "DataSequence", tracks: Mapping[int, Tracks], objects: Objects | None = None
-    ) -> Path | Columns:
-        """Write the tracks of a sequence by frame index; return the file, or its rows of the table of all.
+    ) -> Path | Iterable[Columns]:
+        """Write the tracks of a sequence by frame index; return the file, or blocks of rows of the table of all.
 
-        Only a table has columns for `objects`.
+        The blocks are made when they are taken, once. Only a table has columns for `objects`.
         """
         place = self._dataset.georeference
         if self._features:
-            columns = track_columns(sequence.name, tracks, georeference=place)
-            columns["stamp_ns"] += self._dataset.time_origin_ns
-            return columns
+            blocks = track_columns(sequence.name, tracks, georeference=place)
+            return ({**one, "stamp_ns": one["stamp_ns"] + self._dataset.time_origin_ns} for one in blocks)
         if is_openlabel(self._out):
             from optipmb_tools.results.openlabel import write_openlabel  # noqa: PLC0415  of one format
 
@@ -275,12 +276,13 @@ class Results:
             full_path(path).unlink(missing_ok=True)
         return path
 
-    def take(self, sequence: "DataSequence", written: Path | Columns) -> bool:
+    def take(self, sequence: "DataSequence", written: Path | Iterable[Columns]) -> bool:
         """Keep what `write` returned; return whether it is here: another machine may have written it elsewhere."""
-        here = not isinstance(written, Path) or written.is_file()
-        if here:
-            self._taken[sequence.name] = written
-        return here
+        if isinstance(written, Path) and not written.is_file():
+            return False
+        kept = written if isinstance(written, Path) else [self._blocks.append(block) for block in written]
+        self._taken[sequence.name] = kept
+        return True
 
     def state(self, sequences: "Sequence[DataSequence]") -> str:
         """Remove unfinished files of a run that ends early, and say what is complete."""
@@ -294,14 +296,22 @@ class Results:
         Sequences that were not taken are missing in the table; a file of a benchmark is written of all or not at all.
         Return notes on omissions.
         """
-        parts = [written for _, written in sorted(self._taken.items()) if not isinstance(written, Path)]
+        parts = [places for _, places in sorted(self._taken.items()) if not isinstance(places, Path)]
         if parts:
-            columns = {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])}
             if self._features:
-                return write_features(self._out, columns)
-            write_tracks(self._out, columns, self._dataset.digits)
+                return write_features(self._out, joined(self._rows(parts)))
+            write_tracks(self._out, lambda: self._rows(parts), self._dataset.digits)
         elif not is_openlabel(self._out) and all(one.name in self._taken for one in sequences):
             self._dataset.join(self._out, sequences)
             if (self._out / SHOWN).is_dir():
                 self._dataset.join(self._out / SHOWN, sequences)
         return []
+
+    def _rows(self, parts: Sequence[list[int]]) -> Iterator[Columns]:
+        """Yield the blocks of several sequences, each column with one type that holds the values of all."""
+        types = [{name: values.dtype for name, values in self._blocks[places[0]].items()} for places in parts]
+        wanted = {name: np.result_type(*(one[name] for one in types)) for name in types[0]}
+        wanted |= {name: np.dtype(np.str_) for name, one in wanted.items() if one.kind == "U"}  # of any length
+        for place in itertools.chain(*parts):
+            block = self._blocks[place]
+            yield {name: block[name].astype(one, copy=False) for name, one in wanted.items()}

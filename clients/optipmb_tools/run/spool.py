@@ -1,8 +1,5 @@
 """Tracks of a recording in a temporary file, so that memory does not hold all of its frames."""
 
-import pickle
-import tempfile
-import weakref
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Final, Self
 
@@ -10,21 +7,18 @@ import numpy as np
 from numpy.typing import NDArray
 from optipmb_schemas import Tracks
 
+from optipmb_tools.spool import Spool
+
 BLOCK: Final = 512
 """Frames that are written and read together."""
 
 
 class SpooledTracks(Mapping[int, Tracks]):
-    """Tracks by frame index, in blocks of joined columns; the block that was used last is in memory.
-
-    The file has no name, and ends with the process.
-    """
+    """Tracks by frame index, in blocks of joined columns; the block that was used last is in memory."""
 
     def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115  as long as this object
-        weakref.finalize(self, self._file.close)
+        self._blocks = Spool()
         self._place: dict[int, tuple[int, int]] = {}  # block, and place in it, of each frame
-        self._start: list[int] = []  # of each block in the file
         self._rows: list[int] = [0]  # before each frame, in the order in which they were added
         self._last: list[Tracks] = []  # of the block that is not written yet
         self._held: tuple[int, list[Tracks]] = (-1, [])
@@ -38,19 +32,20 @@ class SpooledTracks(Mapping[int, Tracks]):
 
     def __getitem__(self, index: int) -> Tracks:
         block, place = self._place[index]
-        if block == len(self._start):
+        if block == len(self._blocks):
             found = self._last[place]
         else:
             if self._held[0] != block:
                 self._held = block, self._read(block)
             found = self._held[1][place]
-        rows = slice(*self._rows[block * BLOCK + place :][:2])
+        row = block * BLOCK + place
+        rows = slice(self._rows[row], self._rows[row + 1])
         changed = {name: values[rows] for name, values in self._changed.items()}
         return found.model_copy(update=changed) if changed else found
 
     def add(self, index: int, tracks: Tracks) -> None:
         """Take the tracks of a frame."""
-        self._place[index] = len(self._start), len(self._last)
+        self._place[index] = len(self._blocks), len(self._last)
         self._rows.append(self._rows[-1] + len(tracks.id))
         self._last.append(tracks)
         if len(self._last) == BLOCK:
@@ -59,8 +54,8 @@ class SpooledTracks(Mapping[int, Tracks]):
     def columns(self, wanted: Mapping[str, Callable[[Tracks], NDArray[Any]]]) -> dict[str, NDArray[Any]]:
         """Return values of all rows, in the order in which their frames were added."""
         parts: dict[str, list[NDArray[Any]]] = {name: [] for name in wanted}
-        for block in range(len(self._start) + bool(self._last)):
-            frames = self._read(block) if block < len(self._start) else self._last
+        for block in range(len(self._blocks) + bool(self._last)):
+            frames = self._read(block) if block < len(self._blocks) else self._last
             for name, value in wanted.items():
                 parts[name].append(np.concatenate([value(one) for one in frames]))
         return {name: np.concatenate(part) for name, part in parts.items() if part}
@@ -68,7 +63,7 @@ class SpooledTracks(Mapping[int, Tracks]):
     def with_columns(self, columns: Mapping[str, NDArray[Any]]) -> Self:
         """Return the same tracks with other values of some columns, in the order of `columns`."""
         changed = object.__new__(type(self))
-        vars(changed).update(vars(self) | {"_changed": columns, "_origin": self})  # which closes the file
+        vars(changed).update(vars(self) | {"_changed": columns})
         return changed
 
     def _write(self) -> None:
@@ -85,14 +80,11 @@ class SpooledTracks(Mapping[int, Tracks]):
             ({name: value for name, value in vars(one).items() if name not in joined}, one.model_fields_set)
             for one in self._last
         ]
-        self._file.seek(0, 2)
-        self._start.append(self._file.tell())
-        pickle.dump((joined, rest), self._file, protocol=5)
+        self._blocks.append((joined, rest))
         self._last = []
 
     def _read(self, block: int) -> list[Tracks]:
-        self._file.seek(self._start[block])
-        joined, rest = pickle.load(self._file)  # noqa: S301  of this process
+        joined, rest = self._blocks[block]
         ends = np.array(self._rows[block * BLOCK :][: len(rest) + 1]) - self._rows[block * BLOCK]
         return [
             Tracks.of_valid(values | {name: one[first:last] for name, one in joined.items()}, given)

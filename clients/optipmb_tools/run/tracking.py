@@ -327,7 +327,7 @@ class RecordingsFailed(ClientError):  # noqa: N818  as its siblings
             self.add_note(trace)
 
 
-def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
+def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Iterable[Columns]]:
     """Track one sequence and write its results; idempotent. Return the rows where all sequences share one table."""
     dataset, how = job.dataset, job.how
     sequence = job.sequences[name] if name in job.sequences else dataset.sequences([name])[0]
@@ -346,6 +346,8 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Columns]:
         found = replace(found, tracks=joined_tracks)
         objects = None
     written = Results(dataset, job.out, full=how.full).write(sequence, found.tracks, objects)
+    if job.here is None and not isinstance(written, Path):
+        written = list(written)
     if how.view is not None:
         from optipmb_tools.views.page import write_page  # noqa: PLC0415  only where it is asked for
 

@@ -404,8 +404,8 @@ class TableDataset(Dataset):
         """Write `out/NAME.csv`, or the format of the detections."""
         suffix = self.path.suffix if self.path.is_file() and self.path.suffix.lower() in SUFFIXES else ".csv"
         path = out / f"{sequence.name}{suffix}"
-        columns = track_columns(sequence.name, tracks, sequence, georeference=self.georeference)
-        write_tracks(path, columns, self.digits)
+        place = self.georeference
+        write_tracks(path, lambda: track_columns(sequence.name, tracks, sequence, georeference=place), self.digits)
         return path
 
 
