@@ -14,6 +14,7 @@ from optipmb_schemas import PATHS
 from optipmb_tools.datasets import Dataset, Preloaded, open_dataset, selected_frames
 from optipmb_tools.evaluation.tracks import read_tracks
 from optipmb_tools.results.output import Results, track_columns
+from optipmb_tools.run import tracking
 from optipmb_tools.run.profiles import read_profile
 from optipmb_tools.run.spool import BLOCK, SpooledTracks
 from optipmb_tools.run.tracking import Tracking, decided, track, track_whole
@@ -46,8 +47,12 @@ def test_predicted_paths_are_written_with_all_columns(dataset: Dataset, tmp_path
 
 
 @pytest.mark.parametrize("how", [{"hindsight_s": 0.5}, {"show": 0.3}, {"hindsight_s": 0.5, "show": 0.9}], ids=str)
-def test_tracks_are_confirmed_as_asked(dataset: Dataset, how: dict[str, float]) -> None:
-    """Existence, `confirmed` and velocity are in hindsight where there is one, from the existence that is asked for."""
+@pytest.mark.parametrize("together", [tracking.ROWS, 40])
+def test_tracks_are_confirmed_as_asked(
+    dataset: Dataset, monkeypatch: pytest.MonkeyPatch, how: dict[str, float], together: int
+) -> None:
+    """Existence, `confirmed` and velocity are in hindsight, where there is one, by any number of rows."""
+    monkeypatch.setattr(tracking, "ROWS", together)
     (sequence,), parameters = dataset.sequences(["0000"]), read_profile("scene")
     plain = track_whole(parameters, sequence)
     found, shown = decided(plain, Tracking(parameters, **how)), how.get("show")

@@ -51,13 +51,20 @@ class SpooledTracks(Mapping[int, Tracks]):
         if len(self._last) == BLOCK:
             self._write()
 
-    def columns(self, wanted: Mapping[str, Callable[[Tracks], NDArray[Any]]]) -> dict[str, NDArray[Any]]:
-        """Return values of all rows, in the order in which their frames were added."""
+    def columns(
+        self, wanted: Mapping[str, Callable[[Tracks], NDArray[Any]]], rows: NDArray[np.bool_] | None = None
+    ) -> dict[str, NDArray[Any]]:
+        """Return values of all rows, or of these, in the order in which their frames were added."""
         parts: dict[str, list[NDArray[Any]]] = {name: [] for name in wanted}
         for block in range(len(self._blocks) + bool(self._last)):
+            last = min((block + 1) * BLOCK, len(self._rows) - 1)
+            of_block = None if rows is None else rows[self._rows[block * BLOCK] : self._rows[last]]
+            if of_block is not None and not of_block.any():
+                continue
             frames = self._read(block) if block < len(self._blocks) else self._last
             for name, value in wanted.items():
-                parts[name].append(np.concatenate([value(one) for one in frames]))
+                values = np.concatenate([value(one) for one in frames])
+                parts[name].append(values if of_block is None else values[of_block])
         return {name: np.concatenate(part) for name, part in parts.items() if part}
 
     def with_columns(self, columns: Mapping[str, NDArray[Any]]) -> Self:

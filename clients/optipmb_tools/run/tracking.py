@@ -57,6 +57,8 @@ if TYPE_CHECKING:
 _TOLD = ("id", "label", "existence", "age", "time_since_detection")  # columns that tell whether tracks are shown
 _MOTION = ("acceleration", "yaw", "yaw_rate", "velocity")
 _VARIANCE: Mapping[str, Callable[[Tracks], NDArray[Any]]] = {"covariance": lambda one: one.covariance[:, V, V]}
+ROWS = 1 << 17
+"""Of tracks that are decided in hindsight together: a row takes 300 bytes then."""
 SHOWN = 20  # recordings that failed, named in the error
 
 
@@ -286,10 +288,21 @@ def decided(tracked: Tracked, how: Tracking) -> SpooledTracks:
     if how.hindsight_s and len(found):
         velocity_s = 0.0 if how.smooth or tracked.estimated else how.hindsight_s
         names = [*_TOLD, *(_MOTION if velocity_s else ())]
-        rows = found.columns({**{name: operator.attrgetter(name) for name in names}, **_VARIANCE})
-        rows["covariance"] = np.broadcast_to(rows["covariance"][:, None, None], (len(rows["id"]), STATE, STATE))
-        (changed,) = with_hindsight([SimpleNamespace(**rows)], how.parameters, velocity_s=velocity_s, show=how.show)
-        return found.with_columns(changed | {"confirmed": changed["confirmed"].astype(np.int64)})
+        wanted: dict[str, Callable[[Tracks], NDArray[Any]]] = {name: operator.attrgetter(name) for name in names}
+        wanted |= _VARIANCE
+        identity = found.columns({"id": operator.attrgetter("id")})["id"]
+        columns: Columns = {}
+        for ids in np.split(unique := np.unique(identity), np.searchsorted(unique, np.sort(identity)[ROWS::ROWS])):
+            if not len(ids):  # a track of more rows is before
+                continue
+            of_ids = (identity >= ids[0]) & (identity <= ids[-1])
+            rows = found.columns(wanted, of_ids)
+            rows["covariance"] = np.broadcast_to(rows["covariance"][:, None, None], (len(rows["id"]), STATE, STATE))
+            (changed,) = with_hindsight([SimpleNamespace(**rows)], how.parameters, velocity_s=velocity_s, show=how.show)
+            changed["confirmed"] = changed["confirmed"].astype(np.int64)
+            for name, values in changed.items():
+                columns.setdefault(name, np.empty((len(identity), *values.shape[1:]), values.dtype))[of_ids] = values
+        return found.with_columns(columns)
     if how.show is not None and len(found):
         shown = found.columns({"existence": operator.attrgetter("existence")})["existence"] >= how.show
         return found.with_columns({"confirmed": shown.astype(np.int64)})
