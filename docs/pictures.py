@@ -319,10 +319,10 @@ def draw_gap(axes: Axes) -> None:
     ends = found.take(np.array([earlier]))
     seconds = float(found.first_ns[later] - ends.last_ns[0]) * 1e-9
     x, y = np.meshgrid(np.arange(0.0, 62.0, 0.25), np.arange(-18.0, 16.0, 0.25))
-    way, variance, reach = tuple(ends.end_velocity[0].tolist()), float(ends.end_variance[0]), 35.0 * seconds
+    way, variance = tuple(ends.end_velocity[0].tolist()), float(ends.end_variance[0])
     here, unknown, car = ends.end[0].tolist(), (np.nan, np.nan), np.array(motion_of("car"))
     scores = [
-        motion_score((one - here[0], two - here[1]), way, variance, unknown, np.nan, seconds, reach, car)
+        motion_score((one - here[0], two - here[1]), way, variance, unknown, np.nan, seconds, car)
         for one, two in zip(x.ravel().tolist(), y.ravel().tolist(), strict=True)
     ]
     density = np.exp(scores).reshape(x.shape)

@@ -125,6 +125,13 @@ def log_sum(a: float, b: float) -> float:
 
 
 @kernel
+def reach_of(t: float, own: Array) -> float:
+    """Return the largest distance that an object moves in a gap of `t` s, m; `own` (8,) are the fields of `Motion`."""
+    reach: float = own[7] * t + REACH_M
+    return reach
+
+
+@kernel
 def motion_score(
     offset: tuple[float, float],
     velocity: tuple[float, float],
@@ -132,7 +139,6 @@ def motion_score(
     later: tuple[float, float],
     w_variance: float,
     t: float,
-    reach: float,
     own: Array,
 ) -> float:
     """Return log [p(y, w | i, T) / p(w | new)], and log p(y | i, T) where w is unknown.
@@ -144,7 +150,6 @@ def motion_score(
         later: velocity w at the first place, NaN where unknown.
         w_variance: of either component.
         t: T, s.
-        reach: largest distance, m.
         own: (8,) the fields of `Motion`.
     """
     noise, known = 2.0 * own[0] ** 2, not math.isnan(w_variance)
@@ -164,7 +169,7 @@ def motion_score(
             math.log(STANDING / stands) - 0.5 * square / stands,
         )
     moving = 1 if velocity[0] ** 2 + velocity[1] ** 2 > MOVING**2 else 0
-    total = WEIGHTS[moving, 3] / (math.pi * reach**2)
+    total = WEIGHTS[moving, 3] / (math.pi * reach_of(t, own) ** 2)
     total += WEIGHTS[moving, 0] * math.exp(-0.5 * (a[0] + b[0]) - new) / math.sqrt(a[1] * b[1])
     total += WEIGHTS[moving, 1] * math.exp(-0.5 * (c[0] + d[0]) - new) / math.sqrt(c[1] * d[1])
     total += WEIGHTS[moving, 2] * math.exp(-0.5 * (e[0] + f[0]) - new) / math.sqrt(e[1] * f[1])
@@ -179,8 +184,7 @@ def pair_score(i: Tracklets, n: int, j: Tracklets, k: int, kind: Index, motion: 
         return -math.inf
     own = motion[i.label[n]]
     x, y = j.begin[k, 0] - i.end[n, 0], j.begin[k, 1] - i.end[n, 1]
-    reach = own[7] * t + REACH_M
-    if x**2 + y**2 > reach**2:
+    if x**2 + y**2 > reach_of(t, own) ** 2:
         return -math.inf
     vx, vy, variance = i.end_velocity[n, 0], i.end_velocity[n, 1], i.end_variance[n]
     if math.isnan(variance):
@@ -191,7 +195,7 @@ def pair_score(i: Tracklets, n: int, j: Tracklets, k: int, kind: Index, motion: 
     wx, wy = j.begin_velocity[k, 0], j.begin_velocity[k, 1]
     offset, later = (cos * x + sin * y, cos * y - sin * x), (cos * wx + sin * wy, cos * wy - sin * wx)
     velocity = (cos * vx + sin * vy, cos * vy - sin * vx)
-    moved = motion_score(offset, velocity, variance, later, j.begin_variance[k], t, reach, own)
+    moved = motion_score(offset, velocity, variance, later, j.begin_variance[k], t, own)
     return moved + math.log(RETURNS / (max(t, SHORTEST_S) * math.log1p(gap_s / SHORTEST_S)))
 
 
@@ -232,7 +236,7 @@ class KnownTexts(NamedTuple):
 
     @classmethod
     def of(cls, attributes: Attributes | None) -> KnownTexts:
-        """Return those that have evidence enough."""
+        """Return the attributes with enough evidence."""
         if attributes is None:
             return NO_TEXTS
         rows, share = leading(attributes)

@@ -470,9 +470,7 @@ def lasting(own: Array, axis: int, prior: float) -> float:
 def learn_scatter(
     sums: tuple[Array, Array],
     innovations: Array,
-    before_words: Array,
-    prior_words: Array,
-    words: Array,
+    words: tuple[Array, Array, Array],
     hits: tuple[Index, Index],
     position: Array,
     moment: tuple[int, int],
@@ -483,14 +481,14 @@ def learn_scatter(
     Arguments of its own:
         sums: `scatter` and `lagged` of `SelfCalibration`.
         innovations: of the objects of the frame before.
-        before_words, prior_words, words: arrays of those, of the predicted and of the updated `Bernoullis`.
+        words: arrays of the `Bernoullis` of the frame before, of the predicted and of the updated ones.
         hits: `row` and `measurement` of the updated ones, as in `optipmb.model.stages.Update`.
         position: (M, 2) or (M, 5) of the measurements.
         moment: stamps of the frame and of the one before.
     """
     scatter, lagged = sums
     out, products, known = scatter.copy(), lagged.copy(), squares(scatter, lagged)
-    before, prior, objects = objects_in(before_words), objects_in(prior_words), objects_in(words)
+    before, prior, objects = objects_in(words[0]), objects_in(words[1]), objects_in(words[2])
     (row, measurement), (stamp_ns, before_ns), b = hits, moment, 0
     kept = np.zeros((row.shape[0], lagged.shape[1]))
     for k in range(row.shape[0]):
@@ -532,8 +530,7 @@ def learn_scatter(
 @kernel
 def learn_frame(
     counts: tuple[Array, Slots, Index, tuple[Array, Array], Array],
-    before_words: Array,
-    prior: tuple[Array, Array],
+    prior: tuple[Array, Array, Array],
     posterior: tuple[Array, Index, Index, Index, Index],
     detections: tuple[Array, Array, Index, Index],
     position: Array,
@@ -544,19 +541,18 @@ def learn_frame(
 
     Arguments of its own:
         counts: the arrays before it; `sums` and `innovations` last.
-        prior: arrays of the predicted objects and components.
+        prior: arrays of the objects of the frame before, and of the predicted objects and components.
         posterior: array of the objects; `row`, `measurement` and `fate` of `Update`; and `Misses.looked_ns`, (0,) where
             every frame looks at all objects.
     """
     classes, slots, bins, sums, innovations = counts
     (words, row, hit, fate, looked_ns), now = posterior, Moment(*moment)
     looked = looked_ns == now.stamp_ns if looked_ns.shape[0] else np.ones(hit.shape[0], np.bool_)
-    given, label = (classes.copy(), slots, bins), components_in(prior[1]).label
-    found = learn(given, before_words, (words, hit, looked), label, fate, detections, now.dt)
+    given, label = (classes.copy(), slots, bins), components_in(prior[2]).label
+    found = learn(given, prior[0], (words, hit, looked), label, fate, detections, now.dt)
     stamps = now.stamp_ns, now.before_ns
-    scatter, lagged, kept = learn_scatter(
-        sums, innovations, before_words, prior[0], words, (row, hit), position, stamps, table
-    )
+    three = prior[0], prior[1], words
+    scatter, lagged, kept = learn_scatter(sums, innovations, three, (row, hit), position, stamps, table)
     return (*found, scatter, lagged, kept)
 
 
@@ -613,8 +609,7 @@ def followed(
         fate = np.where(fate >= 0, MARKED, fate)
     classes, objects, components, scatter, lagged, innovations = learn_frame(
         (own.classes, own.objects, bins, (own.scatter, own.lagged), own.innovations),
-        density.bernoulli.words,
-        (prior.bernoulli.words, prior.poisson.words),
+        (density.bernoulli.words, prior.bernoulli.words, prior.poisson.words),
         (update.objects, update.row, update.measurement, fate, looked_ns),
         (scores.given, scores.meant, scores.label, rows),
         measurements.position,

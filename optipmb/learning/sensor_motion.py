@@ -153,7 +153,7 @@ def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> tuple[De
         return density, None
     given = NOTHING if before is None else before.copy()  # which may be written to, as one type for the kernel
     detections = frame.score, frame.center, frame.label
-    step, motion, after = next_motion(density.bernoulli.words, given, *detections, dt, density.stamp_ns, table.classes)
+    step, motion, after = next_motion(density.bernoulli.words, given, detections, dt, density.stamp_ns, table.classes)
     if step == BEGINS:
         density = _over_ground(density, motion, dt, frame)
     if step != STAYS:
@@ -165,9 +165,7 @@ def follow_sensor(density: Density, frame: Frame, table: ClassTable) -> tuple[De
 def next_motion(
     object_words: Array,
     sensor: Array,
-    score: Array,
-    center: Array,
-    label: Index,
+    detections: tuple[Array, Array, Index],
     dt: float,
     before_ns: int,
     classes: Classes,
@@ -177,14 +175,14 @@ def next_motion(
     Arguments of its own:
         object_words: array of the `Bernoullis` of the frame before.
         sensor: (5,) `Density.sensor`, or `NOTHING`.
-        score, center, label: of all detections of the frame.
+        detections: score, center and label of all detections of the frame.
         dt: s since the frame before.
         before_ns: stamp of that frame.
 
     Returns:
         `STAYS`, `MOVES` or `BEGINS`; the motion t and theta (3,), zero where the density stays; and the next `sensor`.
     """
-    objects = objects_in(object_words)
+    objects, (score, center, label) = objects_in(object_words), detections
     distance = np.full(objects.label.shape[0], math.inf)
     for n in range(objects.label.shape[0]):
         sure = objects.seen_ns[n] == before_ns and objects.existence[n] >= SURE

@@ -24,7 +24,7 @@ from optipmb.model.errors import ParameterError
 from optipmb.model.polygons import crosses_itself, inside
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Collection, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -251,8 +251,7 @@ def observe(
     tracks: Tracks,
     labels: Sequence[str],
     shapes: Shapes | None = None,
-    objects: Index | None = None,
-    gap_s: float = 0.0,
+    joined: tuple[Index, float] | None = None,
 ) -> tuple[ZoneState, tuple[Event, ...]]:
     """Return the state after a frame, and its events ordered by time, zone and id.
 
@@ -263,11 +262,11 @@ def observe(
         tracks: of the frame.
         labels: the classes.
         shapes: the zones as arrays, where they are at hand.
-        objects: (N,) id of the first track of the object of each track, -1 while that is not decided; None: tracks are
-            not joined.
-        gap_s: time after which an object may still be joined.
+        joined: (N,) id of the first track of the object of each track, -1 while that is not decided, and the longest
+            gap of a join, s; None: tracks are not joined.
     """
     known, numbers = dict(state.tracks), dict(state.objects)
+    objects, gap_s = joined or (None, 0.0)
     if objects is not None:
         _rejoined(zones, known, numbers, stamp_ns, dict(zip(tracks.id.tolist(), objects.tolist(), strict=True)))
     events: list[Event] = []
@@ -298,11 +297,11 @@ def observe(
         if seen_now is not None and not seen_now.confirmed:
             events += seen_now.held
             known[identities[row]] = seen_now._replace(confirmed=True, held=())
-    first = []
+    first = set()
     for one in events:
         if one.kind == "entered" and one.zone not in (seen_now := known[one.id]).entered:
             known[one.id] = seen_now._replace(entered=(*seen_now.entered, one.zone))
-            first.append((one.zone, one.id, one.at_ns))
+            first.add((one.zone, one.id, one.at_ns))
     times = [_ns(one.lost_s) for one in zones if one.polygon] or [_ns(Zone.lost_s)]
     soonest_ns, longest_ns = min(times), max(times)
     here = set(identities)
@@ -484,14 +483,14 @@ def _left(zone: Zone, visit: Visit, now: Event, how: How) -> list[Event]:
 
 
 def _counted(
-    state: ZoneState, events: Iterable[Event], first: Sequence[tuple[str, int, int]] = ()
+    state: ZoneState, events: Iterable[Event], first: Collection[tuple[str, int, int]] = ()
 ) -> tuple[ZoneState, tuple[Event, ...]]:
     """Return the state with events counted, and these with their numbers.
 
     Args:
         state: of the zones.
         events: of the frame.
-        first: zone, id and time of those by which objects enter a zone that they have not been in.
+        first: zone, id and time of the events by which objects enter a zone for the first time.
     """
     ordered = sorted(events, key=lambda one: (one.at_ns, one.zone, one.id, one.kind))
     if not ordered:

@@ -34,9 +34,8 @@ CAR = np.array(evidence.motion_of("car"))
 def score_of(seconds: float, **known: Any) -> float:
     """Return the score of a gap of an object that moves along at 5 m/s."""
     values = {"offset": (0.0, 0.0), "later": (np.nan, np.nan), "later_variance": np.nan} | known
-    reach = 35.0 * seconds + 3.0
     return evidence.motion_score(
-        values["offset"], (5.0, 0.0), 0.04, values["later"], values["later_variance"], seconds, reach, CAR
+        values["offset"], (5.0, 0.0), 0.04, values["later"], values["later_variance"], seconds, CAR
     )
 
 
@@ -340,7 +339,7 @@ s = [2, 8]
     (WAY.replace("[2, 8]", "[6, 8]"), (20, 104, 0, -8), [1, 2]),
 ])  # fmt: skip
 def test_places_hold_for_recordings(text: str, path: Any, expected: list[int], tmp_path: Path) -> None:
-    """What is lost in an exit of the file is not joined; a passage joins its ends within its time."""
+    """Objects lost in an exit of the file are not joined; a passage joins its ends within its time."""
     (tmp_path / "settings.toml").write_text(text)
     frames = gaps.cars((0, 3, (0, 0), (8, 0)), (8, 10, path[:2], path[2:]))
     how = RejoinOptions(60.0, 0.9, *rejoining.places_in(tmp_path / "settings.toml"))

@@ -278,7 +278,7 @@ def test_scatter_is_summed_over_sure_pairs_as_in_numpy(seed: int) -> None:
     noise, known = np.array([0.3, 0.25]), squares(scatter, lagged)
     np.testing.assert_allclose(known - scatter, np.column_stack((np.zeros(2), np.maximum(lagged, 0.0))))
     hits, rows, words = (row, measurement), class_rows(2, noise_position=noise), (old.words, prior.words, objects.words)
-    found, products, kept = learn_scatter((scatter, lagged), last, *words, hits, position, (now, before), rows)
+    found, products, kept = learn_scatter((scatter, lagged), last, words, hits, position, (now, before), rows)
 
     k = np.flatnonzero((row >= 0) & (measurement >= 0))
     n, m = row[k], measurement[k]

@@ -398,10 +398,9 @@ class Transition:
         if state.session != before.session:
             state, ended = end(zones, state)
             state = replace(state, session=before.session)
-        objects = None if result.joined is None else result.joined.object
-        labels = self.parameters.labels
-        gap_s = 0.0 if self._policy.rejoin is None else self._policy.rejoin.gap_s
-        state, events = observe(zones, state, stamp_ns, result.tracks, labels, self._shapes, objects, gap_s)
+        labels, rejoin = self.parameters.labels, self._policy.rejoin
+        joined = None if result.joined is None or rejoin is None else (result.joined.object, rejoin.gap_s)
+        state, events = observe(zones, state, stamp_ns, result.tracks, labels, self._shapes, joined)
         return state, (*ended, *events)
 
     def _unknown(self, message: schemas.Detections, reported: frozenset[str]) -> dict[str, int]:

@@ -43,6 +43,7 @@ class Claim:
     wins: Literal["taken", "doubt", "refused"] = "taken"  # what happens to the table where it has the best evidence
     sure: bool = True  # whether there is enough evidence to refuse by
     possible: bool = True  # whether the values can have this meaning
+    least: float = 0.0  # share of the evidence below which it is doubted, also without a rival
 
     def beats(self, other: "Claim") -> bool:
         """Tell whether this is the better way: the only possible one, or that with the stronger evidence."""
@@ -135,7 +136,6 @@ class Reading:
         expected: str = "",
         received: str = "",
         asked: str | None = None,
-        least: float = 0.0,
     ) -> str:
         """Return the value of the claim that holds; report it, or a rival that beats it.
 
@@ -147,7 +147,6 @@ class Reading:
             expected: For the error.
             received: For the error where not exactly one claim is possible, and the user has to choose.
             asked: Value that the user has chosen.
-            least: Share of the evidence below which the claim is doubted, also without a rival.
         """
         rival = max(claims, key=lambda one: (one.possible, one.evidence.share))
         held = next((one for one in claims if one.value == asked), claims[0])
@@ -164,7 +163,7 @@ class Reading:
             self.refuse(topic, expected, received, held.option)
         elif disputed and asked is None and rival.wins == "refused" and rival.sure and weak:
             self.refuse(topic, expected, counted, rival.option)
-        elif disputed or mine.bounds[1] < least:
+        elif disputed or mine.bounds[1] < held.least:
             text = f"{clash}: {counted}" if clash else counted
             self.add(Finding(topic, text, rival.option if disputed else held.option, doubt=True, evidence=other))
         elif held.text:

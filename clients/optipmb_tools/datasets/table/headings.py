@@ -202,9 +202,11 @@ def read_heading(
         what, option = "along another axis: a sensor that moves?", _POSES
     if way.bearing and other == "y-clockwise":
         wins, what = "taken", f"yaw is in {found}, clockwise from y"
+    least = LEAST_ALONG if sure else 0.0
+    own = "" if asked or unit else "--option yaw=degrees, radians"
     claims = [
-        Claim(axis, share(found, axis)[0], text, "" if asked or unit else "--option yaw=degrees, radians"),
-        Claim(other, share(found, other)[0], what, option, wins, sure and explains),
+        Claim(axis, share(found, axis)[0], text, own, least=least),
+        Claim(other, share(found, other)[0], what, option, wins, sure and explains, least=least),
     ]
     if way.bearing and not (count or way.compass or zero):
         reading.doubt("yaw", f"{text}; it may be clockwise from north", "--option heading=y-clockwise, or heading=x")
@@ -215,7 +217,6 @@ def read_heading(
         clash="headings and motion disagree",
         expected="headings along the motion of the boxes",
         asked=zero,
-        least=LEAST_ALONG if sure else 0.0,
     )
     if claims[axis == other].evidence.share > HALF and not way.moving:  # along a grid of streets only the sense differs
         poses = _POSES if way.unposed and one_way(moves) else ""
@@ -327,5 +328,5 @@ def read_velocity(reading: Reading, velocity: Floats, moves: Moves, draft: Draft
             return axes, wrong
     clash = f"velocities and motion disagree: {np.median(speed):.3g} m/s on average, boxes move at"
     clash += f" {np.median(real):.3g} m/s; another unit, or relative to the sensor?"
-    claims = [Claim(axes, Evidence(float(fits.sum()), len(known)))]
-    return reading.decide("velocity", claims, "moves have the velocity of their box", clash=clash, least=HALF), none
+    claims = [Claim(axes, Evidence(float(fits.sum()), len(known)), least=HALF)]
+    return reading.decide("velocity", claims, "moves have the velocity of their box", clash=clash), none
