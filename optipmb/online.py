@@ -492,13 +492,14 @@ class OnlineTracker:
         if camera is None:
             return _columns(boxes, arrays), None, 0
         pixels = _pixels(boxes, arrays)
-        looks, texts = pixels.pop("embedding", None), pixels.pop("attributes", None)
+        of_boxes = {name: pixels.pop(name) for name in ("embedding", "attributes") if pixels.get(name) is not None}
         columns = self._on_ground(camera, pose, pixels)
+        count = len(pixels["box"] if "box" in pixels else pixels["foot"])
         row, outside = columns.pop("row"), sum(columns.pop("left_out").values())
-        if looks is not None:
-            columns["embedding"] = np.asarray(looks)[row]
-        if texts is not None:
-            columns["attributes"] = [texts[one] for one in row.tolist()]
+        for name, values in of_boxes.items():
+            if len(values) != count:
+                raise FrameError(name, f"{count} values, one for each box", str(len(values)))
+            columns[name] = np.asarray(values)[row] if name == "embedding" else [values[one] for one in row.tolist()]
         return columns, row, outside
 
     def _doubt(self, frame: Frame) -> None:

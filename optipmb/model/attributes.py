@@ -82,7 +82,7 @@ def readings_of(given: Sequence[Mapping[str, Any] | None], count: int) -> Readin
             for part, path in ((name, f"attributes[{row}]"), (text, f"attributes[{row}].{name}")):
                 if not isinstance(part, str) or not 1 <= len(part.encode()) <= MOST_BYTES or "\0" in part:
                     raise FrameError(path, f"a text of 1 to {MOST_BYTES} bytes, or one with its score", repr(part)[:80])
-            if not isinstance(score, (int, float)) or not 0.0 < score <= 1.0:
+            if not isinstance(score, int | float | np.floating) or not 0.0 < score <= 1.0:
                 raise FrameError(f"attributes[{row}].{name}", "a score in (0, 1]", repr(score)[:80])
             rows.append((row, name, text, float(score)))
     row_of, names, texts, scores = zip(*rows, strict=True) if rows else ((), (), (), ())
@@ -130,7 +130,7 @@ def _groups(ids: Index, names: Index) -> tuple[Index, Index]:
 
 
 def _leading(group: NDArray[np.integer], value: NDArray[np.number]) -> Index:
-    """Return the place of each row among those of its group, the largest value first."""
+    """Return the rank of each row in its group; the largest value has rank 0."""
     order = np.lexsort((-value, group))
     place = np.empty(len(group), np.int64)
     start = np.searchsorted(group[order], group[order])

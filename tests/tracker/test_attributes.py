@@ -26,10 +26,11 @@ def tracked(frames: list[dict[str, Any]], attributes: Any, how: Rejoin | None = 
 
 
 def test_a_track_keeps_the_text_with_most_evidence() -> None:
-    """Scores of a text add up; its share of the evidence is told, and detections without attributes change nothing."""
+    """Scores of a text add up; detections without attributes leave its share of the evidence as it is."""
 
     def reading(t: float) -> dict[str, Any] | None:
-        return {0.1: {"plate": ("8", 0.9)}, 0.2: {"plate": ("B", 0.5)}, 0.3: {"plate": ("B", 0.7)}}.get(round(t, 1))
+        plates = {0.1: ("8", 0.9), 0.2: ("B", 0.5), 0.3: ("B", np.float32(0.7))}
+        return {"plate": plates[at]} if (at := round(t, 1)) in plates else None
 
     tracks = tracked(gaps.cars((0, 3, (0, 0), (8, 0)))[:20], reading)
     texts, share = tracks.attributes["plate"]
@@ -53,7 +54,7 @@ def test_a_contradiction_forbids_a_join(later: str | None, expected: int) -> Non
 
 
 def test_equal_attributes_raise_the_odds_within_a_bound() -> None:
-    """Each equal attribute adds 3 to the log odds, all together no more than 6, beside cars that fit equally well."""
+    """Each equal attribute adds 3 to the log odds, all together no more than 6, where two cars fit equally well."""
 
     def odds(names: int) -> float:
         frames = gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 2.5), (8, 0)), (7, 10, (0, -2.5), (8, 0)))

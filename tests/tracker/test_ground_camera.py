@@ -489,10 +489,12 @@ def test_a_pose_belongs_to_a_camera_on_a_vehicle() -> None:
         ("fixed", {"label": [7], "class": None}, "label"),
         ("fixed", {"label": ["car"]}, "label"),
         ("fixed", {"camera": None}, "box"),
+        ("fixed", {"attributes": [None, None]}, "attributes"),
+        ("fixed", {"embedding": np.ones((0, 4)), "embedding_model": "any"}, "embedding"),
     ],
 )
 def test_the_tracker_refuses_what_no_camera_gives(mount: str, given: dict[str, Any], path: str) -> None:
-    """A vehicle without a pose, a fixed camera with one, other columns, and boxes without a camera are refused."""
+    """A vehicle without a pose, a fixed camera with one, wrong columns, and boxes without a camera are refused."""
     camera = optipmb.GroundCamera.parse(pinhole(mount=mount))
     boxes: dict[str, Any] = {"box": [[900, 700, 1000, 780]], "class": ["car"], "t": 0.0, "camera": camera} | given
     tracker = optipmb.OnlineTracker("generic")

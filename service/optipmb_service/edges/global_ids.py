@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from optipmb_schemas import Links, Tracks
 
 MOST: Final = 100_000
-"""Objects of an area, as many as a message has; with more, those whose row is the oldest are forgotten."""
+"""Objects of an area, as many as a message has; with more, the objects with the oldest rows are forgotten."""
 
 
 class GlobalIds:
@@ -26,11 +26,13 @@ class GlobalIds:
         self._areas: OrderedDict[str, OrderedDict[tuple[str, str, int], str]] = OrderedDict()
 
     def take(self, message: Links) -> None:
-        """Take the rows of a message; those of the whole state replace all others of its area."""
+        """Apply the rows of a message; a message with the whole state replaces all rows of its area."""
         with self._lock:
             rows = OrderedDict() if message.whole else self._areas.get(message.area, OrderedDict())
             for one in message.objects:
-                rows[one.stream, one.session, one.object] = one.global_id.hex()
+                key = one.stream, one.session, one.object
+                rows[key] = one.global_id.hex()
+                rows.move_to_end(key)
             while len(rows) > MOST:
                 rows.popitem(last=False)
             remember(self._areas, message.area, rows)

@@ -122,12 +122,15 @@ def separate(frame: JsonFrame) -> Iterator[JsonFrame]:
         yield frame._replace(message=message.model_copy(update={"field_of_view": NOWHERE}))
     spread = message.position_covariance
     variances = np.full(len(places), nan) if spread is None else spread[:, 0, 0] + spread[:, 1, 1]
+    attributes: dict[int, list[schemas.Attribute]] = {}
+    for one in message.attributes or ():
+        attributes.setdefault(one.row, []).append(one.model_copy(update={"row": 0}))
     for at, (place, variance) in enumerate(zip(places.tolist(), variances.tolist(), strict=True)):
         values: dict[str, Any] = {
             name: column[at : at + 1] for name in COLUMNS if (column := getattr(message, name)) is not None
         }
         values |= {"field_of_view": _beside(place, variance), "stamp_ns": message.stamp_ns + at * STEP_NS}
-        values["attributes"] = schemas.attributes_of_rows(message.attributes, [at])
+        values["attributes"] = tuple(attributes.get(at, ())) or None
         yield frame._replace(message=message.model_copy(update=values))
 
 

@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from optipmb_schemas import Detections, Pose, Tracks, encode, encode_json, encoding_of
+from optipmb_service.edges import global_ids
 from optipmb_service.edges.global_ids import GlobalIds
 from optipmb_service.edges.http import application, page
 from optipmb_service.edges.http.page import Live, live_frame
@@ -248,6 +249,16 @@ def test_global_ids_are_drawn_where_they_are_known() -> None:
     assert "global" not in json.loads(live_frame(Publication(*given)) or b"")
     ids.take(links((STREAM, 5, "a")))
     assert json.loads(live_frame(Publication(*given)) or b"")["global"] == ["a" * 32]
+
+
+def test_the_objects_with_the_oldest_rows_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new row of an object makes it the newest one of its area."""
+    monkeypatch.setattr(global_ids, "MOST", 2)
+    ids = GlobalIds()
+    for rows in ([(STREAM, 5, "a"), (STREAM, 6, "b")], [(STREAM, 5, "c")], [(STREAM, 7, "d")]):
+        ids.take(links(*rows, whole=False))
+    message = tracks(1).model_copy(update={"session": "0" * 32, "id": np.array([5, 6, 7])})
+    assert list(ids.of(message)) == ["c" * 32, "", "d" * 32]
 
 
 def test_a_pose_at_the_origin_is_no_sensor() -> None:
