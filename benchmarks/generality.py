@@ -229,7 +229,7 @@ def track(clip: Clip, parameters: Parameters, *, posed: bool, hindsight: float) 
     while index < len(clip.frames):
         result = tracker.step(density, clip.frames[index])
         density, found[index], index = result.density, result.tracks, index + 1
-        if hindsight and density.on_vehicle and not tried:  # as `optipmb track` begins anew
+        if hindsight and density.on_vehicle and not tried:  # `optipmb track` starts over here too
             density, index, tried = replace(tracker.initial(), sensor=UNKNOWN_MOTION), 0, True
     if hindsight:
         changed = with_hindsight(list(found.values()), parameters, velocity_s=hindsight if posed else 0.0)

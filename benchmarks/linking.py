@@ -6,7 +6,7 @@ it. A link is right if both tracks are mostly of one object; `while it held`, if
 were linked: a track may go over to another object.
 
 With `--kitti DIR`, two detectors saw one drive: each is a stream, and the second one is at another place and time.
-Objects are those of the labels within `NEAR_M` of a detection.
+Objects are the labelled ones within `NEAR_M` of a detection.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ Key = tuple[str, int]
 
 
 class Owners(NamedTuple):
-    """The object that each track is mostly of, and that of its newest detection after each frame."""
+    """Object with most detections of each track, and object of its newest detection after each frame."""
 
     mostly: dict[Key, int]
     newest: dict[tuple[str, int], dict[int, int]]

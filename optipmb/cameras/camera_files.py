@@ -239,7 +239,7 @@ def _sensors_of_yaml(text: str) -> dict[str, str]:
 
 
 def _is_matrix(name: object) -> bool:
-    """Tell whether a name is that of a matrix of a camera."""
+    """Return whether a name denotes the matrix or the projection of a camera."""
     return re.fullmatch(f"{_MATRIX}|{_PROJECTION}", str(name).lower()) is not None
 
 

@@ -210,7 +210,7 @@ def _add(arrays: tuple[Singles, Singles, Index], n: int, decided: bool, vector: 
 
 @kernel
 def _count(arrays: tuple[Singles, Singles, Index], rows: Index, kind: Index, counts: Array, stamp_ns: int) -> None:
-    """Count the distances of rows (K,) of decided tracks from what they were, and from each other."""
+    """Count the distances of decided tracks, rows (K,), from their kept vectors, and from each other."""
     total, first, stamps = arrays
     for a in range(rows.shape[0]):
         n, c = rows[a], kind[a]

@@ -79,9 +79,9 @@ RIVAL_NS: Final = 3 * 10**9
 LEAST_SIZES: Final = 5
 """Tracks of a class from which its sizes count while tracking."""
 MOST_SCORES: Final = 20_000
+"""Most pairs that are scored in a frame; the longest lost objects are left out first."""
 MOST_PAIRS: Final = 4000
-"""Bounds of a frame: pairs that are scored, of which those of the longest lost are left out, and pairs of the matching,
-of which the lowest are."""
+"""Most pairs of the matching of a frame; the lowest scores are left out first."""
 _NS: Final = 1e-9
 
 _BOUNDS: Final = MappingProxyType(
@@ -143,7 +143,7 @@ class Rejoin:
 
 
 class Kinds(NamedTuple):
-    """What joining knows of classes, and of the place."""
+    """Constants of the classes for joining, and the declared places."""
 
     motion: Array  # (C, 8) fields of `Motion`
     kind: Index  # (C,) first class of its group
@@ -152,7 +152,7 @@ class Kinds(NamedTuple):
 
     @classmethod
     def of(cls, parameters: Parameters, settings: Rejoin | None = None) -> Kinds:
-        """Return what joining knows of the classes of a profile, and what settings declare."""
+        """Return the constants of the classes of a profile, and the places that the settings declare."""
         groups = [one.group or name for name, one in parameters.classes.items()]
         motion = np.array([motion_of(name) for name in parameters.labels])
         kind = np.array([groups.index(one) for one in groups], dtype=np.int64)
@@ -412,7 +412,7 @@ def _within_limits(lost_words: Array, stamp_ns: int, gap_s: float, most: int) ->
 
 @kernel
 def _objects_of(identity: Index, live: Tracklets) -> tuple[Index, Array, Index, Array]:
-    """Return object, candidate and their probabilities of tracks by their ids, ascending; -1 of what is not live."""
+    """Return object, candidate and their probabilities of tracks (ascending ids); -1 where a track is not live."""
     objects, probability, k = np.full(identity.shape[0], -1), np.ones(identity.shape[0]), 0
     candidate, chance = np.full(identity.shape[0], -1), np.full(identity.shape[0], math.nan)
     for n in range(identity.shape[0]):
@@ -574,7 +574,7 @@ def rejoin_tracks(
 
 
 def _of_objects(attributes: Attributes, before: Rejoining, live: Tracklets) -> Attributes:
-    """Return the attributes with those of lost objects for the tracks that continue them now."""
+    """Move the attributes of lost objects to the tracks that continue them now."""
     last = {
         number: row
         for rows in (before.lost, before.live)

@@ -1,4 +1,4 @@
-"""Matching of ends and beginnings with the largest sum of scores, and what it loses without each pair."""
+"""Matching of ends and beginnings with the largest sum of scores, and the loss of this sum without each pair."""
 
 from __future__ import annotations
 
@@ -137,8 +137,8 @@ def match(i: Index, j: Index, value: Array, wanted: Flags, rows: int) -> tuple[F
         rows: how many there are.
 
     Returns:
-        Which pairs are taken (P,); what the sum loses without each wanted one (P,); and of each wanted column (M,) the
-        largest sum with it less the largest one without, -inf where it has no pair.
+        Which pairs are taken (P,); the loss of the sum without each wanted pair (P,); and of each wanted column (M,)
+        the largest sum with it less the largest one without, -inf where it has no pair.
     """
     columns = wanted.shape[0]
     count = rows + columns

@@ -45,9 +45,9 @@ LEARNED_NS: Final = 600 * 10**9
 ELSEWHERE_M: Final = 6.0
 """Returns nearer to where they were lost teach nothing: motion says more, and at a door others come out."""
 LIKELY: Final = (0.02, 0.8)
-"""Bounds of the probability that an object returns which was lost at a place, and"""
+"""Bounds of the probability that an object returns which was lost at a place."""
 PRIOR_ENDS: Final = 2.0
-"""ends that weigh as much as what is supposed of any place, `RETURNS`."""
+"""Ends that weigh as much as the probability without any ends, `RETURNS`."""
 MOST_ENDS: Final = 500
 LEARNED: Final = 0.8
 """Share of the returns that are like others, if many are known; it is half from"""
@@ -99,7 +99,7 @@ class DeclaredPlaces(NamedTuple):
 
     @classmethod
     def of(cls, exits: tuple[Polygon, ...] = (), passages: tuple[Passage, ...] = ()) -> DeclaredPlaces:
-        """Return what is declared as arrays."""
+        """Return the exits and passages as arrays."""
         shapes = [*exits, *(one for way in passages for one in (way.start, way.end))]
         ends = [np.array(way.end, np.float64) for way in passages]
         turned = [one[:, 0] * np.roll(one[:, 1], -1) - one[:, 1] * np.roll(one[:, 0], -1) for one in ends]

@@ -54,7 +54,7 @@ Class = Annotated[str, Meta(description="Name of the class.")]
 
 Told = Annotated[
     dict[str, tuple[str, float]],
-    Meta(description="What is known of the object, as its plate: by name a text and its share of the evidence."),
+    Meta(description="Attributes of the object, as its plate: by name a text and its share of the evidence."),
 ]
 
 

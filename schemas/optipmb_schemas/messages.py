@@ -513,7 +513,7 @@ class Events(ResultMessage):
         default=(), max_length=100_000, fail_fast=True, description="In order of `at_ns`, `zone` and `id`."
     )
     attributes: tuple[Attribute, ...] | None = Field(
-        default=None, max_length=100_000, description="What is known of the objects of the events, as in `Tracks`."
+        default=None, max_length=100_000, description="Attributes of the objects of the events, as in `Tracks`."
     )
     zones: tuple[ZoneCount, ...] | None = Field(
         default=None,

@@ -497,7 +497,7 @@ class InputSettings(BaseModel):
     """values by their paths in the payload, as `{ "after.camera" = "gate" }`; other payloads are refused, over
     MQTT left out or of another input of the topic"""
     clock: Literal["sender", "arrival", "offset"] = "sender"
-    """stamps of frames: the sender's; those of their arrival; or the sender's moved to the clock of this machine"""
+    """stamps of frames: the sender's; the time of their arrival; or the sender's moved to the clock of this machine"""
     classes: dict[str, str] = Field(default_factory=dict)
     """names of classes by those of the sender, as `{ Human = "pedestrian" }`; others stay"""
     camera: Path | None = None

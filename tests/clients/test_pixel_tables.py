@@ -224,7 +224,7 @@ def test_boxes_of_coco_are_places(tmp_path: Path, camera: optipmb.GroundCamera, 
         for k, frame in enumerate(frames(camera))
         for box in frame.tolist()
     ]
-    images = [{"id": k, "file_name": f"{k}.jpg"} for k in range(30)]
+    images = [{"id": k, "file_name": f"{k}.jpg", "width": 1920, "height": 1080} for k in range(30)]
     content = {"images": images, "annotations": boxes, "categories": [{"id": 3, "name": "car"}]} if whole else boxes
     (tmp_path / "coco.json").write_text(json.dumps(content))
     options = gate | {"rate": "10"} | ({} if whole else {"class.3": "car"})

@@ -342,7 +342,7 @@ def test_a_folder_reads_its_tables_and_no_notes(tmp_path: Path) -> None:
 
 
 def test_a_column_that_is_text_in_one_frame_is_text(tmp_path: Path) -> None:
-    """Classes of a folder with a table for each frame are read as those of one table would be."""
+    """Classes of a folder with a table for each frame are read as from one table."""
     for i, labels in enumerate((["Car"], [7, 7, 8])):
         rows = [f"{k + 1},2,0,4,2,1.5,0.1,0.9,{label}\n" for k, label in enumerate(labels)]
         (tmp_path / f"{i:06d}.csv").write_text("x,y,z,length,width,height,yaw,score,label\n" + "".join(rows))

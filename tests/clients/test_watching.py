@@ -125,7 +125,7 @@ def test_tracks_are_boxes_of_their_colour_with_id_and_existence() -> None:
 
 
 def test_tracks_of_an_object_are_one_in_views() -> None:
-    """Where tracks are joined over gaps, label and colour are those of the object, as soon as it is decided."""
+    """Where tracks are joined over gaps, a track has the label and colour of its object as soon as it is decided."""
     log = Log()
     joined = {"object": np.array([3, 4, -1]), "object_probability": np.ones(3, np.float32)}
     View(log).show(tracks(1, [3, 10, 11]).model_copy(update=joined))  # type: ignore[arg-type]  # as above

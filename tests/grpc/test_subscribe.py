@@ -77,7 +77,7 @@ def test_the_first_tracks_of_a_subscription_in_force_come(service: ServiceProces
 
 
 def test_attributes_go_with_their_tracks() -> None:
-    """A filter leaves those of the tracks that it chooses, by their new rows, and none where only columns are asked."""
+    """A filter keeps the attributes of the chosen tracks, by their new rows, and none where only columns are asked."""
     proto = pb.Tracks(labels=["car", "pedestrian"])
     for name, values in (("label", np.array([0, 1])), ("existence", np.ones(2)), ("age", np.ones(2))):
         getattr(proto, name).CopyFrom(

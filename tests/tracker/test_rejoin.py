@@ -123,7 +123,7 @@ def test_ends_teach_where_objects_return(gap_s: float) -> None:
 
 
 def test_the_probability_of_a_return_is_that_of_ends_around() -> None:
-    """Ends near a place, of the same kind, count by their distance beside two that return every second time."""
+    """Ends near a place, of the same kind, count by their distance, with two more that return every second time."""
     ends = Ends.of(np.zeros(4 * Ends.width))
     ends.id[:], ends.kind[:], ends.returned[:] = range(4), (0, 0, 1, 0), (1.0, 0.2, 1.0, 1.0)
     ends.place[:] = (0, 0), (3, 0), (0, 0), (30, 0)

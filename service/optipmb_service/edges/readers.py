@@ -651,7 +651,7 @@ class Feeds:
         return [Publication(one.key, one.payload, one.encoding, *about, live=False) for one in answers if one.ok]
 
     def _read_links(self) -> None:
-        """Begin to read the links of all areas, with what is linked already, before the first tracks are read."""
+        """Begin to read the links of all areas, also the present ones, before the first tracks are read."""
         with self._linking:
             if self._links is not None:
                 return

@@ -160,7 +160,7 @@ def density_of(
 
 
 def attributes_of(density: optipmb.Density, identity: Sequence[int]) -> tuple[schemas.Attribute, ...]:
-    """Return what is known of tracks by their ids."""
+    """Return the attributes of tracks, by their ids."""
     if density.attributes is None or not len(identity):
         return ()
     found = shown_of(density.attributes, np.array(identity, np.int64))

@@ -26,7 +26,7 @@ CODES: Final = {
         "Send velocities over ground, in m/s, along the axes of the boxes; or none.",
     ),
     "size": (
-        "Most sizes are wider than long, or far from those of their classes.",
+        "Most boxes are wider than long, or far from the sizes of their classes.",
         "Send length, width, height in metres.",
     ),
     "no_pose": (

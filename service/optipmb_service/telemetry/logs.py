@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from structlog.typing import EventDict, Processor, WrappedLogger
 
 EVENTS: Final = {
-    "log_lines_dropped": "Nobody read stderr in time: `count` lines were not written.",
+    "log_lines_dropped": "stderr was not read in time: `count` lines were not written.",
     "starting": "The service compiles or loads its kernels.",
     "connecting": "Waits for a router. If this lasts, check `connect`.",
     "http": "Health, metrics and the live page are served at `address`.",
@@ -79,7 +79,7 @@ EVENTS: Final = {
     "store_failed": "Checkpoints cannot be written (disk full, read-only): tracking goes on, the state is `degraded`.",
     "store_back": "Checkpoints are written again.",
     "partitions_held": "Number of partitions that this member holds, and the `members`.",
-    "leases_damaged": "The `file` of the leases was damaged, as by a power cut, and made anew.",
+    "leases_damaged": "The `file` of the leases was damaged, as by a power cut, and is created again.",
     "lease_lost": "This member was frozen or cut off for `lease_s`, and others continue its streams. It joins again.",
     "leases_failed": "The servers of `cluster`, or the folder `store`, cannot be used, for `error`: after half of"
     " `lease_s` nothing is published, and the state is `paused`.",

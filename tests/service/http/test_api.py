@@ -186,7 +186,7 @@ def test_a_map_gets_the_newest_tracks_as_points(session: Session, watched: Watch
 
 
 def test_a_feature_has_the_id_of_its_object(session: Session, watched: Watched) -> None:
-    """Where tracks are joined over gaps, ids of features are those of objects, whatever fields are asked for."""
+    """Where tracks are joined over gaps, features have the ids of objects, for any choice of fields."""
     known = {"id": np.array([5, 8]), "object": np.array([3, -1]), "object_probability": np.ones(2, np.float32)}
     joined = tracks(3).model_copy(update=known)
     session.cache = [(key_of(joined), joined)]

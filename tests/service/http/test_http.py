@@ -444,7 +444,7 @@ def test_the_health_command() -> None:
 
 
 def test_a_server_that_ends_later_than_it_may_ends_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its thread, which nobody waits for any more, still has its socket: else it would end with an exception."""
+    """Its thread still has its socket after the wait for it ended: else it would end with an exception."""
     one = Server(application(Watched(), Settings(), None), "127.0.0.1:0", 1000)
     threads = [thread for thread in threading.enumerate() if thread.name == "http"]
     monkeypatch.setattr(server, "GRACE_S", 0)

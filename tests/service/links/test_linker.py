@@ -183,7 +183,7 @@ def test_clocks_set_back(seconds: int, site: tuple[World, list[Tracks]]) -> None
 
 
 def test_swapped_frames(site: tuple[World, list[Tracks]]) -> None:
-    """World frames that were taken for each other link nobody."""
+    """World frames that were taken for each other link no objects."""
     _, messages = site
     frames = {"site/west/lidar": WorldFrame(0, 30.0, -20.0, 1.5), "site/east/lidar": WorldFrame(0, -10.0, 25.0, -0.7)}
     assert run(messages, area(frames.__getitem__)).rows() == []

@@ -105,7 +105,7 @@ def test_killed_with_a_cluster(services: ServiceProcess, settings: Path, tmp_pat
             time.sleep(2.0)  # it is saved once a second
             process.end(signal.SIGKILL)
         for publisher in publishers:
-            publisher.close()  # and with it what it had published
+            publisher.close()  # with the cache of its messages
         with link(services, settings, nats.url) as process:
             process.wait_ready()
             assert until_linked(connection) == before
@@ -191,7 +191,7 @@ def test_vectors(services: ServiceProcess, settings: Path) -> None:
             for publisher, place in ((west, still), (east, (100.0, 0.0) - still)):
                 looks(publisher, range(frame, frame + 1), place[None], vectors)
             time.sleep(0.01)
-        for frame in range(400, 700):  # west sees nobody any more, then all of them elsewhere, in another order
+        for frame in range(400, 700):  # west sees no object any more, then all of them elsewhere, in another order
             order = vectors[::-1] if frame >= 480 else vectors
             looks(west, range(frame, frame + 1), elsewhere if frame >= 480 else still[None, :0], order)
             looks(east, range(frame, frame + 1), still[None, :0], vectors)

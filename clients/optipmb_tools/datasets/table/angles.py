@@ -59,7 +59,7 @@ def read_turn(reading: Reading, topic: str, parts: Floats, *, named: bool) -> Fl
         topic,
         claims,
         "boxes then stand upright",
-        expected="quaternions whose order is told by upright boxes",
+        expected="quaternions whose order follows from upright boxes",
         received="boxes that all have one of two headings" if alike else "",
         asked=asked,
     )

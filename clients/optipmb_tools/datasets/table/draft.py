@@ -171,8 +171,8 @@ def missing(reading: Reading, draft: Draft, role: str) -> DatasetError:
         others = f", and columns {', '.join(lacks[1:])}" if len(lacks) > 1 else ""
         expected = f"a column of stamps ({option}) or of frames{others}"
     have = [*draft.columns]
-    beside = {re.sub(r"\d+", "#", name) for names in likely.values() for name in names if re.search(r"\d", name)}
-    sets = [name for names in likely.values() for name in names if re.sub(r"\d+", "#", name) in beside]
+    numbered = {re.sub(r"\d+", "#", name) for names in likely.values() for name in names if re.search(r"\d", name)}
+    sets = [name for names in likely.values() for name in names if re.sub(r"\d+", "#", name) in numbered]
     if len(sets) > len(likely) * 2 and "stamp" not in lacks:  # such a column has one of the objects alone
         expected = f"a row for each box, with columns {', '.join(lacks)}, instead of objects side by side"
         return DatasetError(reading.path, expected, f"the columns {', '.join(sets[:_MOST_NAMED])}")

@@ -99,7 +99,7 @@ def _check_sizes(
     """Doubt sizes that would be usual ones of their classes if they were multiplied by a factor."""
     usual = {name: USUAL[kind] for name, kind in kinds.items() if kind is not None and kind in USUAL}
     known = bool(usual)
-    usual = usual or dict.fromkeys(kinds, USUAL["car"])  # of unknown classes those of cars tell the unit of length
+    usual = usual or dict.fromkeys(kinds, USUAL["car"])  # of unknown classes the sizes of cars tell the unit of length
     rows = np.isin(names, list(usual)) & np.isfinite(sizes).all(axis=1)
     found, place = unique_texts(names[rows])
     bounds = np.array([usual[name] for name in found.tolist()]).reshape(-1, 3, 2)[place]
