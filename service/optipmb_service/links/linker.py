@@ -190,7 +190,7 @@ class Linker:
         own = self.objects.table
         linked = self.pairs["linked"].copy(), views.keys_of(self.pairs)
         if now is not None:
-            self.pairs, self.biases, whole = views.sample(self.pairs, self.biases, now, stamp_ns)
+            self.pairs, self.biases, whole = views.sample(self.pairs, self.biases, now, self._parts_of(now), stamp_ns)
             self.pairs = views.decide(self.pairs, now, self.settings.min_probability)
             text = "" if whole else "too many tracks at one place: only near pairs are looked at"
             self.inputs.say("", "crowded", text)
@@ -200,11 +200,18 @@ class Linker:
         own["ended"][revived] = 0
         self._drop_pairs(stamp_ns)
         changed = before != len(own) or len(self._part) != len(own)
-        if changed or not self._same_links(*linked) or ended.any() or revived.any():
+        opposed = changed or len(parts.opposed(self.objects, self.pairs, self._part)) > 0
+        if opposed or not self._same_links(*linked) or ended.any() or revived.any():
             self._settle()
         if self._continue(stamp_ns, np.flatnonzero(ended)):
             self._settle()
         self._forget(stamp_ns)
+
+    def _parts_of(self, now: Present) -> Index:
+        """Return the parts of tracks; one that is new is a part of its own."""
+        part = np.arange(len(self.objects.table)) + len(self._part)
+        part[: len(self._part)] = self._part
+        return np.asarray(np.unique(part[self.objects.at(now.number)], return_inverse=True)[1])
 
     def _same_links(self, flags: NDArray[np.int8], keys: Index) -> bool:
         return np.array_equal(keys[flags > 0], views.keys_of(self.pairs)[self.pairs["linked"] > 0])
@@ -257,6 +264,10 @@ class Linker:
         """Forget pairs that say nothing any more, and withdraw links over a gap that was none."""
         pairs, own = self.pairs, self.objects
         old = (pairs["evidence"] < views.LEAST) | (pairs["stamp_ns"] < stamp_ns - 2 * FRESH_NS)
+        # Evidence against two tracks of one part keeps them apart: it is forgotten only once they are gone.
+        a, b = (own.at(pairs[side]) for side in ("a", "b"))
+        part = parts.connected(len(own.table), a[pairs["linked"] > 0], b[pairs["linked"] > 0])
+        old &= (part[a] != part[b]) | (pairs["stamp_ns"] < stamp_ns - 2 * FRESH_NS)
         pairs = pairs[(pairs["linked"] > 0) | (~old & (pairs["how"] == 0))]
         apart = np.flatnonzero(pairs["how"] > 0)
         if len(apart):

@@ -146,16 +146,29 @@ def unmatched(now: Present, alone: Array) -> Array:
     return np.asarray((0.5 + (every[where] - mine[own]) / others) / CELL_M**2)
 
 
-def sample(pairs: Table, biases: Table, now: Present, stamp_ns: int) -> tuple[Table, Table, bool]:
+def within(parts: Index, now: Present) -> Index:
+    """Return pairs (P, 2) of rows of different streams that are of one part."""
+    order = np.lexsort((now.stream, parts))
+    found = [np.zeros((0, 2), np.int64)]
+    for step in range(1, int(np.bincount(parts).max())):
+        one, other = order[:-step], order[step:]
+        same = (parts[one] == parts[other]) & (now.stream[one] != now.stream[other])
+        found.append(np.column_stack((one, other))[same])
+    return np.concatenate(found)[:MOST_PAIRS]
+
+
+def sample(pairs: Table, biases: Table, now: Present, parts: Index, stamp_ns: int) -> tuple[Table, Table, bool]:
     """Return pairs and biases after a common time, and whether all pairs were looked at.
 
     Args:
         pairs: `PAIR`, ascending.
         biases: `BIAS`, ascending.
         now: the tracks, ascending numbers.
+        parts: of the tracks.
         stamp_ns: the time.
     """
     rows, whole = near(now)
+    rows = np.concatenate((rows, within(parts, now)))
     kept = pairs[pairs["how"] == 0]
     kept = kept[np.isin(kept["a"], now.number) & np.isin(kept["b"], now.number)]
     found = np.unique(np.concatenate((now.number[rows[:, 0]] << 31 | now.number[rows[:, 1]], keys_of(kept))))

@@ -231,6 +231,18 @@ def test_parting() -> None:
     assert len({row.global_id for row in told}) == 1
 
 
+def test_parting_after_a_third_view() -> None:
+    """Two who part are two objects also where both are linked to a track of a third stream that has ended."""
+    pair = beside(line(1.0, y=-0.15), line(1.0, y=0.15, turn=2.0))
+    first = World(pair.label[:1], pair.place[:, :1])
+    west = copied(first, WEST, 1)
+    east = copied(World(pair.label[1:], pair.place[:, 1:]), EAST, 1)
+    third = copied(first, View("site/third/lidar", WEST.inside), 1, frames=range(150))
+    linker = run(sorted([*west, *east, *third], key=lambda one: one.stamp_ns))
+    found = ids(linker)
+    assert found.get(("site/west/lidar", 0), b"0") != found.get(("site/east/lidar", 0), b"1")
+
+
 def test_session_restarts() -> None:
     """An object keeps its id while a stream that sees it begins another session."""
     world = plaza(5, 16.0, objects=12)
