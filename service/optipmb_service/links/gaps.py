@@ -240,7 +240,7 @@ def decide(
     odds = np.minimum(np.where(fits, odds * np.exp(more), 0.0), MOST_ODDS)
     share = odds / (1.0 + odds.sum(axis=0))
     score = np.where(odds > 1.0, np.log(np.maximum(odds, 1e-300)), 0.0)
-    before, after = np.nonzero(score > 0.0)
+    before, after = map(np.ascontiguousarray, np.nonzero(score > 0.0))  # as the kernel is compiled for
     value = np.round(score[before, after] / QUANTUM) * QUANTUM
     partner, sure = np.full(len(young.number), -1), np.zeros(len(young.number))
     if len(before):
