@@ -16,8 +16,8 @@ from optipmb_tools.evaluation.tracks import read_tracks
 from optipmb_tools.results.output import Results, track_columns
 from optipmb_tools.run import tracking
 from optipmb_tools.run.profiles import read_profile
-from optipmb_tools.run.spool import BLOCK, SpooledTracks
 from optipmb_tools.run.tracking import Tracking, decided, track, track_whole
+from optipmb_tools.spool import BLOCK, SpooledTracks
 from optipmb_tools.table_files import Columns, joined, write_table
 
 from optipmb.learning.hindsight import with_hindsight

@@ -1,7 +1,7 @@
 """Offline tracking: one sequence in this process, or the recordings of a data set, one task each.
 
 A replay through the service (`optipmb_tools.run.replay`) gives the same bytes, but where the motion of a sensor without
-poses is estimated: only recordings can begin anew when later frames show that it is on a vehicle.
+poses is estimated: only a recording can be tracked a second time when later frames show that it is on a vehicle.
 """
 
 import functools
@@ -48,7 +48,7 @@ from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, Dete
 from optipmb_tools.files import remove_unfinished
 from optipmb_tools.results.output import Latency, Results, TrackCounts, horizons_for, latency
 from optipmb_tools.run.bulk import Executor, Failed, Here, in_order, run
-from optipmb_tools.run.spool import SpooledTracks
+from optipmb_tools.spool import SpooledTracks
 from optipmb_tools.table_files import Columns
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ def track_whole(
     """Track one sequence, with `smooth` so that states are given all frames of their track.
 
     Frames that name their sensor are used as `sensors` say. Once frames without poses show that the sensor is on a
-    vehicle, the sequence is tracked anew with that knowledge: with `sensor` as `Density.sensor` before the first frame.
+    vehicle, the sequence is tracked from its beginning again, with `sensor` as `Density.sensor` before the first frame.
 
     Raises:
         UsageError: A frame holds values that the tracker refuses.
