@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
-from optipmb_schemas import PREFIX, Attribute, Detections, FieldOfView, Keys, MessageError, Points, Pose, Relocation
+from optipmb_schemas import PREFIX, Detections, FieldOfView, Keys, MessageError, Points, Pose, Relocation
 from optipmb_schemas.arrays import ArrayLike, numeric
 
 from optipmb_client.links import Link, linked
@@ -244,15 +244,22 @@ class Publisher:
         )
 
 
-def _attributes(given: Sequence[Mapping[str, str | tuple[str, float]]], count: int) -> tuple[Attribute, ...]:
+def _attributes(given: Sequence[Mapping[str, str | tuple[str, float]]], count: int) -> Any:
+    """Return the attributes as `Detections` takes them, which checks their values."""
     if len(given) != count:
         raise MessageError("invalid_value", "attributes", f"{count} maps, one for each object", str(len(given)))
-    return tuple(
-        Attribute(row=row, name=name, text=text, score=score)
-        for row, one in enumerate(given)
-        for name, value in one.items()
-        for text, score in [(value, 1.0) if isinstance(value, str) else value]
-    )
+    found = []
+    for row, one in enumerate(given):
+        if not isinstance(one, Mapping):
+            raise MessageError("invalid_value", f"attributes[{row}]", "a map of texts by name", type(one).__name__)
+        for name, value in one.items():
+            match value:
+                case [text, score]:
+                    pass
+                case text:
+                    score = 1.0
+            found.append({"row": row, "name": name, "text": text, "score": score})
+    return found
 
 
 def _labelled(label: Any, labels: Sequence[str] | None) -> tuple[tuple[str, ...], Any]:

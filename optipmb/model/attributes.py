@@ -6,6 +6,7 @@ scores. An object keeps its `MOST_NAMES` attributes and the `MOST_TEXTS` texts o
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -26,6 +27,8 @@ MOST_BYTES: Final = 32
 """Longest name and text, bytes of UTF-8, and"""
 WORDS: Final = MOST_BYTES // 8
 """the same in words."""
+_UNSENT: Final = re.compile("[\0\ud800-\udfff]").search
+"""Characters that no text has: the end of bytes, and halves of pairs of UTF-16."""
 
 
 class Attributes(Rows):
@@ -78,15 +81,23 @@ def readings_of(given: Sequence[Mapping[str, Any] | None], count: int) -> Readin
         if len(one or ()) > MOST_NAMES:
             raise FrameError(f"attributes[{row}]", f"at most {MOST_NAMES} attributes", str(len(one or ())))
         for name, value in (one or {}).items():
-            text, score = value if isinstance(value, tuple | list) and len(value) == 2 else (value, 1.0)  # noqa: PLR2004 - text, score
+            match value:
+                case [text, score]:
+                    pass
+                case text:
+                    score = 1.0
             for part, path in ((name, f"attributes[{row}]"), (text, f"attributes[{row}].{name}")):
-                if not isinstance(part, str) or not 1 <= len(part.encode()) <= MOST_BYTES or "\0" in part:
+                if not _is_brief(part):
                     raise FrameError(path, f"a text of 1 to {MOST_BYTES} bytes, or one with its score", repr(part)[:80])
             if not isinstance(score, int | float | np.floating) or not 0.0 < score <= 1.0:
                 raise FrameError(f"attributes[{row}].{name}", "a score in (0, 1]", repr(score)[:80])
             rows.append((row, name, text, float(score)))
     row_of, names, texts, scores = zip(*rows, strict=True) if rows else ((), (), (), ())
     return Readings(np.array(row_of, np.int64), words_of(names), words_of(texts), np.array(scores, np.float64))
+
+
+def _is_brief(part: object) -> bool:
+    return isinstance(part, str) and not _UNSENT(part) and 1 <= len(part.encode()) <= MOST_BYTES
 
 
 def words_of(texts: Sequence[str]) -> Index:

@@ -191,6 +191,10 @@ BAD = [
     ({"relocation": 5}, "relocation"),
     ({"relocation": ([0, 0, 0], [0.8, 0.6, 0, 0])}, "relocation.quaternion"),
     ({"relocation": ([0, 0], [1.0, 0, 0, 0])}, "relocation.translation"),
+    ({"attributes": []}, "attributes"),
+    ({"attributes": [7]}, "attributes[0]"),
+    ({"attributes": [{"plate": 7}]}, "attributes[0].text"),
+    ({"attributes": [{"plate": ("AB 1", 2.0)}]}, "attributes[0].score"),
     ({"points_pose": ([0, 0], [1.0, 0, 0, 0]), "points": np.zeros((4, 3), np.float32)}, "translation"),
 ]
 

@@ -96,6 +96,7 @@ def test_memory_is_bounded() -> None:
         ([{"plate": "ü" * 17}], "attributes[0].plate"),
         ([{"plate": ("AB 1", 1.5)}], "attributes[0].plate"),
         ([{"plate": 7}], "attributes[0].plate"),
+        ([{"plate": "AB \ud800"}], "attributes[0].plate"),
         ([{"": "AB 1"}], "attributes[0]"),
         ([{str(n): "x" for n in range(9)}], "attributes[0]"),
     ],
