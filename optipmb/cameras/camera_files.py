@@ -200,7 +200,7 @@ def read_numbers(path: Path) -> dict[str, str]:
 
 def _chosen(path: Path, sensors: Mapping[str, Any], asked: str, whole: Any) -> Any:
     """Return the part of a file that is of one sensor: the whole of a file with one."""
-    if asked in sensors or (len(sensors) < 2 and not asked):  # noqa: PLR2004 - one has no choice
+    if asked in sensors or (len(sensors) <= 1 and not asked):
         return sensors.get(asked, whole)
     expected = f"one of the sensors {', '.join(f'{path.name}#{name}' for name in sensors)}"
     raise ParameterError("intrinsics", expected, f"{path.name}#{asked}" if asked else path.name)
@@ -214,7 +214,8 @@ def _sensors_of_json(value: Any, name: str) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, part in inner:
         own = dict(_of_json(part)) if isinstance(part, dict) and isinstance(value, list) else {}
-        found |= _sensors_of_json(part, _named(own, _NAME) or str(key))
+        own_sensors = _sensors_of_json(part, _named(own, _NAME) or str(key))
+        found |= {f"{key}.{one}" if one in found else one: sensor for one, sensor in own_sensors.items()}
     return found
 
 
@@ -234,7 +235,8 @@ def _sensors_of_yaml(text: str) -> dict[str, str]:
         own = [key for key in keys[begin:end] if key is not None]
         if any(_is_matrix(key[3]) for key in own):
             named = (key[4].strip(" \"'") for key in own if own[0][2] and re.fullmatch(_NAME, key[3].lower()))
-            found[next(named, str(len(found)) if own[0][2] else own[0][3])] = "\n".join(lines[begin:end])
+            sensor = next(named, str(len(found)) if own[0][2] else own[0][3])
+            found[f"{len(found)}.{sensor}" if sensor in found else sensor] = "\n".join(lines[begin:end])
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import TYPE_CHECKING, Any, Final
 
 import cv2
@@ -561,6 +562,25 @@ def test_one_of_several_sensors_is_named(tmp_path: Path, text: str) -> None:
     for name in ("rig", "rig#top"):
         with pytest.raises(optipmb.ParameterError, match="one of the sensors rig#left, rig#right"):
             read_lens(tmp_path / name, None)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        ('{"front": {"left": {"K": [1, 0, 2, 0, 1, 3, 0, 0, 1], "D": []}}, '
+         '"back": {"left": {"K": [4, 0, 2, 0, 4, 3, 0, 0, 1], "D": []}}}'),
+        ("cams:\n  - name: left\n    intrinsics: [1, 1, 2, 3]\n    D: []\n  - name: left\n"
+         "    intrinsics: [4, 4, 2, 3]\n    D: []\n"),
+    ],
+)  # fmt: skip
+def test_sensors_of_one_name_are_told_apart(tmp_path: Path, text: str) -> None:
+    """The error names both, and each name that it gives is of one sensor."""
+    (tmp_path / "rig").write_text(text)
+    with pytest.raises(optipmb.ParameterError) as error:
+        read_lens(tmp_path / "rig", None)
+    names = re.findall(r"rig#([\w.]+)", str(error.value))
+    assert len(names) == 2
+    assert [read_lens(tmp_path / f"rig#{name}", None)["intrinsics"][0] for name in names] == [1.0, 4.0]
 
 
 def test_poses_of_other_programs_are_read(tmp_path: Path) -> None:
