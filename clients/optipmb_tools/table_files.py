@@ -60,6 +60,7 @@ _MOST_PARTS: Final = 16
 _EXACT: Final = 2**53  # integers up to it are exact as 64-bit numbers with a point
 _INT64: Final = 2**63
 _BLOCK: Final = 1 << 20  # characters of a text that are read at once
+_COCO: Final = "images", "annotations", "categories"
 _ROWS: Final = 1 << 16  # of a text that are written at once
 _PART: Final = 1 << 20  # texts that are compared at once: an array of pyarrow holds 2 GB of them
 _LONGEST_LINE: Final = 1 << 25  # bytes of a line of JSON that pyarrow reads; longer ones are read one by one
@@ -786,7 +787,7 @@ def read_json(path: Path) -> list[_Record]:
     if isinstance(content, dict) and isinstance(content.get("results"), dict):
         how = f"--dataset nuscenes --root ROOT --detections {path}"
         raise DatasetError(path, "a table", f"results of nuScenes, which are read by {how}")
-    if isinstance(content, dict) and {"images", "annotations", "categories"} <= content.keys():
+    if isinstance(content, dict) and all(map(_are_records, map(content.get, _COCO))):
         content = _of_coco(content)
     if isinstance(content, dict):
         known = any(isinstance(content.get(name), list) for name in LISTS)
@@ -800,12 +801,16 @@ def read_json(path: Path) -> list[_Record]:
     return content
 
 
+def _are_records(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(one, dict) for one in value)
+
+
 def _of_coco(content: _Record) -> list[_Record]:
     """Return the annotations of COCO with the names of their classes, and the fields of their images."""
-    names = {one["id"]: one.get("name") for one in content["categories"]}
-    images = {one["id"]: {name: value for name, value in one.items() if name != "id"} for one in content["images"]}
+    names = {str(one.get("id")): one.get("name") for one in content["categories"]}
+    images = {str(one.pop("id", None)): one for one in content["images"]}
     return [
-        images.get(one.get("image_id"), {}) | one | {"class": names.get(one.get("category_id"))}
+        images.get(str(one.get("image_id")), {}) | one | {"class": names.get(str(one.get("category_id")))}
         for one in content["annotations"]
     ]
 
