@@ -90,6 +90,8 @@ class LinkedArea:
             self._fence = store.put(Write(f"link/{name}", settings.instance, record.revision if record else 0))
             if self._fence is None and time.monotonic() > until:
                 raise StoreError(f"link/{name}: other processes take the area again and again")
+            if self._fence is None:
+                time.sleep(PAUSE_S)
         self._saved = b""
         key = client.keys.links(name)
         self._sender = client.cached_sender(key, schemas.encoding_of(schemas.Links), cache=CACHE)
