@@ -734,7 +734,8 @@ class Settings(BaseSettings):
     zenoh_config: Path | None = None
     """Zenoh configuration file (JSON5): TLS, access control, limits of a router; settings override it"""
     shared_memory: bool = False
-    """Zenoh's shared memory: faster for clouds on one host, but may lose messages"""
+    """Zenoh's shared memory: faster for clouds on one host, but may lose messages, and leaves files in /dev/shm after a
+    kill"""
     profile: str = Field(default="generic", min_length=1)
     """profile name or TOML file, where no pattern matches"""
     profiles: dict[str, str] = Field(default_factory=dict)
@@ -812,7 +813,7 @@ class Settings(BaseSettings):
     """a process that is frozen or cut off for this long loses its streams to the others"""
     standby_s: float = Field(default=10.0, ge=0, le=600)
     """how long messages of streams that others track are kept for a takeover; longer than `lease_s` and
-    `checkpoint_s` together"""
+    `checkpoint_s` together; with `cluster` also how far back the message log is read without a checkpoint"""
     standby_mb: int = Field(default=256, ge=1, le=65536)
     """megabytes kept so; clouds are dropped first"""
     log_s: float = Field(default=600.0, ge=10, le=864_000)
