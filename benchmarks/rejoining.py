@@ -15,7 +15,7 @@ import sys
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -243,8 +243,8 @@ def cut_out(frames: Sequence[Frame], seconds: float) -> list[Frame]:
     found, first_ns = [], frames[0].stamp_ns
     for one in frames:
         if int((one.stamp_ns - first_ns) * 1e-9 / seconds) % 3 == 2:
-            none = {name: getattr(one, name)[:0] for name in arrays}
-            found.append(replace(one, **none, position_covariance=None, embedding=None))  # type: ignore[arg-type]
+            none: dict[str, Any] = {name: getattr(one, name)[:0] for name in arrays}
+            found.append(replace(one, **none, position_covariance=None, embedding=None))
         else:
             found.append(one)
     return found

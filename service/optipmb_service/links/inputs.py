@@ -31,7 +31,7 @@ WAIT_NS: Final = 10**9
 FRESH_NS: Final = 10**9
 """Age at which a track that is not detected, or a message, does not count any more."""
 LONG_NS: Final = 2 * 10**9
-"""Times of tracks that are longer are told from no others: a track is fresh, and an object has begun, for less."""
+"""Longest age that is kept of a track, which is fresh, and of an object, which has begun, for less."""
 CLOCK_NS: Final = 2 * 10**9
 """Largest difference of a stream's clock from most other clocks."""
 STUCK_NS: Final = 5 * 10**9
@@ -246,7 +246,7 @@ class LinkInputs:
         self.say("", "set_back", "the clocks of most streams are behind those before: all links begin again")
 
     def _reference(self, arrived_ns: int, stream: InputStream) -> int:
-        """Return the offset of most clocks; of as many, of those that are nearest to the receiver's."""
+        """Return the offset of most clocks; of two equal groups, that which is nearer to the clock of the receiver."""
         others = [
             one.offset_ns
             for one in self.streams.values()

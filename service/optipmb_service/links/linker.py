@@ -315,7 +315,7 @@ class Linker:
         return True
 
     def _begin_again(self) -> None:
-        """End all objects, for the next common time is before those of their tracks."""
+        """End all objects, because the next common time is before the times of their tracks."""
         own = self.objects.table
         told = np.flatnonzero((own["told"] > 0) & (own["ended"] == 0)).tolist()
         self._changes += [self._row(n).model_copy(update={"ended": True}) for n in told]

@@ -46,7 +46,7 @@ class ObjectVectors:
     def see(self, look: Look, numbers: Index, rows: Index, objects: Objects, pairs: Table) -> None:
         """Add the vectors of rows of a message to objects, and count distances.
 
-        Others than an object are those that are there at once, and, once it is linked, all that it is not linked to.
+        Other objects are the present ones; of a linked object, all that it is not linked to.
         """
         if look.vectors is None:
             return

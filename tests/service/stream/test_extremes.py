@@ -67,8 +67,9 @@ def test_a_covariance_that_no_message_can_carry_is_not_published() -> None:
 
 
 def told(found: optipmb.Tracks, paths: optipmb.PredictedPaths | None = None) -> schemas.Tracks:
+    empty = optipmb.Density.empty(NUSCENES.labels)
     return convert.tracks_of(
-        optipmb.StepResult(optipmb.Density.empty(NUSCENES.labels), found, None, paths),  # type: ignore[arg-type]
+        optipmb.StepResult(empty, found, None, paths),  # type: ignore[arg-type]  # of the tracks alone
         SENSOR.stream,
         FrameId(SENSOR.epoch, 1, 2),
         session="0" * 32,

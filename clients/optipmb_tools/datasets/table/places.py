@@ -141,7 +141,7 @@ def read_axes(reading: Reading, center: Floats) -> bool:
         DatasetError: The axes look like a camera's, and no option says so.
     """
     axes = reading.chosen("axes", ("z-up", "camera"))
-    if len(center) < 2:  # noqa: PLR2004  one box has no spread
+    if len(center) <= 1:  # one box has no spread
         return axes == "camera"
     low, high = np.quantile(center, [0.05, 0.95], axis=0)
     across, up = (high - low)[1:]
