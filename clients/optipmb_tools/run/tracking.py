@@ -1,7 +1,6 @@
 """Offline tracking: one sequence in this process, or the recordings of a data set, one task each.
 
-A replay through the service (`optipmb_tools.run.replay`) gives the same bytes, but where the motion of a sensor without
-poses is estimated: only a recording can be tracked a second time when later frames show that it is on a vehicle.
+A replay through the service (`optipmb_tools.run.replay`) gives the same bytes as this without hindsight.
 """
 
 import functools
@@ -75,6 +74,7 @@ class Tracked:
     detections: int
     left_out: dict[str, int]  # detections of each class that the profile lacks, or that are below its score filter
     estimated: int  # frames in which the motion of the sensor was estimated
+    on_vehicle: bool  # the sensor, as `Density.on_vehicle` in the end
     learned: tuple[str, ...]  # noise of the detections of each class, in words
     doubts: tuple[str, ...]  # velocities that contradict the motion of their boxes, by sensor, in words
     steps_ns: tuple[int, ...]
@@ -132,8 +132,7 @@ def track_whole(
 ) -> Tracked:
     """Track one sequence, with `smooth` so that states are given all frames of their track.
 
-    Frames that name their sensor are used as `sensors` say. Once frames without poses show that the sensor is on a
-    vehicle, the sequence is tracked from its beginning again, with `sensor` as `Density.sensor` before the first frame.
+    Frames that name their sensor are used as `sensors` say. `sensor`: `Density.sensor` before the first frame.
 
     Raises:
         UsageError: A frame holds values that the tracker refuses.
@@ -164,11 +163,6 @@ def track_whole(
         result = tracker.step(density, taken)
         steps.append(time.perf_counter_ns() - started)
         density = result.density
-        if density.on_vehicle and sensor is None:
-            left = _from_call(len(found), on_frame)
-            return track_whole(
-                parameters, sequence, classes, modules, sensors=sensors, on_frame=left, sensor=UNKNOWN_MOTION
-            )
         found.add(frame.index, _message(parameters, sequence, frame, result))
         if smoother is not None:
             smoother.add(frame.index, density, result.tracks)
@@ -189,20 +183,9 @@ def track_whole(
             paths = predict_tracks(one, parameters.horizons, parameters) if parameters.horizons else None
             smoothed.add(index, found[index].model_copy(update=fields_of(one, paths)))
         found = smoothed
-    counts = clouds, detections, dict(left_out), estimated
+    counts = clouds, detections, dict(left_out), estimated, density.on_vehicle
     doubts = tuple(one.contradiction for one in checks.values() if one.contradiction)
     return Tracked(found, *counts, learned_noise(density), doubts, tuple(steps), time.monotonic() - begun)
-
-
-def _from_call(number: int, called: Callable[[], None]) -> Callable[[], None]:
-    """Return a function that leaves out so many calls of another."""
-    calls = itertools.count()
-
-    def call() -> None:
-        if next(calls) >= number:
-            called()
-
-    return call
 
 
 def _below_filters(labels: Sequence[str], low: NDArray[np.int64], given: NDArray[np.int64]) -> dict[str, int]:
@@ -346,6 +329,9 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Iterable[C
     sequence = job.sequences[name] if name in job.sequences else dataset.sequences([name])[0]
     options: dict[str, Any] = {"sensors": how.sensors, "smooth": how.smooth, "on_frame": job.on_frame}
     found = track_whole(how.parameters, sequence, how.classes, how.modules, **options)
+    if how.hindsight_s and found.on_vehicle:  # also before its frames showed it
+        options |= {"on_frame": _ignored, "sensor": UNKNOWN_MOTION}
+        found = track_whole(how.parameters, sequence, how.classes, how.modules, **options)
     if how.rejoin is not None and found.estimated:
         expected = "expected boxes in a world frame, or poses of the sensor"
         raise UsageError(f"--rejoin: sequence {name}: {expected}; here the motion of the sensor is estimated")
