@@ -7,6 +7,7 @@ from typing import Any, Self
 from optipmb_schemas import Detections, Keys, Points, encode, encoding_of
 from optipmb_service.session.checkpoint import Checkpoint
 from optipmb_service.settings import Settings
+from optipmb_service.streams.parts import Parts
 from optipmb_service.streams.profiles import Profiles
 from optipmb_service.streams.streams import Streams
 from optipmb_service.telemetry.metrics import Metrics
@@ -65,6 +66,9 @@ class Around:
     def open_publisher(self, _: str, **kinds: bool) -> Self:  # noqa: ARG002 - as the service calls it
         return self
 
+    def ask_cache(self, *_: object) -> None:
+        """Nothing is in a cache."""
+
     def look(self) -> None:
         """Wake no waiting thread."""
 
@@ -89,19 +93,20 @@ def streams_of(
 ) -> Streams:
     parts: Any = around  # in the place of several
     return Streams(
-        Settings(instance="test", store="none", step_limit_s=60, **settings),  # kernels may have to be compiled
-        profiles or Profiles.read("nuscenes", {}),
-        open_publisher=parts.open_publisher,
-        ask_cache=lambda *_: None,
-        reporter=reporter or ProblemReporter(lambda _: None),
-        scheduler=parts,
-        member=parts,
-        checkpoints=parts,
-        log=log,
-        arm=arm,
-        metrics=Metrics(),
-        tracker=tracker,
-        traces=traces,
+        Parts(
+            settings=Settings(instance="test", store="none", step_limit_s=60, **settings),  # kernels may be compiled
+            profiles=profiles or Profiles.read("nuscenes", {}),
+            tracker=tracker,
+            transport=parts,
+            member=parts,
+            checkpoints=parts,
+            log=log,
+            scheduler=parts,
+            arm=arm,
+            reporter=reporter or ProblemReporter(lambda _: None),
+            metrics=Metrics(),
+            traces=traces,
+        )
     )
 
 

@@ -26,6 +26,7 @@ from optipmb_service.session.policy import SECOND
 from optipmb_service.session.problems import problem_of
 from optipmb_service.streams.intake import Intake
 from optipmb_service.streams.kept_tracks import TrackQuery
+from optipmb_service.streams.parts import Parts
 from optipmb_service.streams.persistence import DAY_S, CheckpointWriter
 from optipmb_service.streams.queries import ServiceQueries, StreamQueries, members_of
 from optipmb_service.streams.scheduler import Scheduler
@@ -110,19 +111,20 @@ class Service(Component):
 
             self._traces = Traces(settings.instance)
         self._streams = Streams(
-            settings,
-            profiles,
-            open_publisher=self._transport.open_publisher,
-            ask_cache=self._transport.ask_cache,
-            reporter=self._reporter,
-            scheduler=self._scheduler,
-            member=self._member,
-            checkpoints=self._checkpoints,
-            log=self._log,
-            arm=arm,
-            metrics=self._metrics,
-            tracker=tracker or profiles.trackers(partial(optipmb.Tracker, max_pairs=settings.max_pairs)),
-            traces=self._traces,
+            Parts(
+                settings=settings,
+                profiles=profiles,
+                tracker=tracker or profiles.trackers(partial(optipmb.Tracker, max_pairs=settings.max_pairs)),
+                transport=self._transport,
+                member=self._member,
+                checkpoints=self._checkpoints,
+                log=self._log,
+                scheduler=self._scheduler,
+                arm=arm,
+                reporter=self._reporter,
+                metrics=self._metrics,
+                traces=self._traces,
+            )
         )
         self._intake = Intake(
             self._streams,

@@ -1,6 +1,6 @@
 """Session: the tracking of one stream, or of several sensors that feed one density.
 
-No I/O, no threads, no clock of its own.
+No I/O and no threads. Of the clock it reads only how long steps take.
 
 Conventions: `now_ns` is the local monotonic clock, given by the caller and used only for waiting, for point clouds and,
 during recovery, for frames that were missed; everything else follows from the messages. So the same messages give the
@@ -66,7 +66,6 @@ class Session:
         instance: name of the service, for problems.
         incarnation: ids that an earlier session of the stream used.
         tracker: makes the tracker; tests put their own here.
-        clock: measures how long a step takes, ns.
     """
 
     def __init__(
@@ -79,7 +78,6 @@ class Session:
         instance: str = "session",
         incarnation: Incarnation | None = None,
         tracker: Callable[..., optipmb.Tracker] = optipmb.Tracker,
-        clock: Callable[[], int] = time.perf_counter_ns,
     ) -> None:
         incarnation = incarnation or Incarnation()
         self.stream = stream
@@ -91,7 +89,6 @@ class Session:
         """
         self._fused = fused
         self._make = tracker
-        self._clock = clock
         self._estimated = ""
         """Incarnation in which the motion of a sensor was reported as estimated."""
         self._deliveries = Deliveries()
@@ -283,7 +280,6 @@ class Session:
         fence: int = 1,
         instance: str = "session",
         tracker: Callable[..., optipmb.Tracker] = optipmb.Tracker,
-        clock: Callable[[], int] = time.perf_counter_ns,
     ) -> Self:
         """Return the session that a checkpoint was taken of. It is `recovering` for a while.
 
@@ -297,7 +293,6 @@ class Session:
             fence: of the lease under which it goes on, 1 or higher.
             instance: name of the service, for problems.
             tracker: makes the tracker.
-            clock: measures how long a step takes, ns.
         """
         one = cls(
             checkpoint.stream,
@@ -306,7 +301,6 @@ class Session:
             fused=checkpoint.fused,
             instance=instance,
             tracker=tracker,
-            clock=clock,
         )
         one._cloud_wait_ns = checkpoint.cloud_wait_ns
         if one._cloud_wait_ns is not None:
@@ -544,11 +538,11 @@ class Session:
             self.arrivals.end_at_deadline(now_ns)
         outputs: list[Output] = []
         self._has_ready, taken = False, 0
-        ends_ns = self._clock() + FLUSH_NS if now_ns is None else None
+        ends_ns = time.perf_counter_ns() + FLUSH_NS if now_ns is None else None
         while pending := self._queues.take(now_ns, self._until_ns):
             outputs += self._process(pending)
             taken += 1
-            if ends_ns is not None and self._clock() >= ends_ns:
+            if ends_ns is not None and time.perf_counter_ns() >= ends_ns:
                 return [*outputs, *self._refuse_pending()]
             if ends_ns is None and taken >= self._policy.at_once and not self._queues.is_full:
                 self._has_ready = self.held > 0
@@ -557,7 +551,7 @@ class Session:
 
     def _process(self, pending: PendingFrame) -> list[Output]:
         """Put a frame in its place."""
-        began_ns, frame_id = self._clock(), pending.frame_id
+        began_ns, frame_id = time.perf_counter_ns(), pending.frame_id
         judged_by, decision, timeline = pending.judged
         if judged_by is not self._timeline:  # others were pending when it came
             decision, timeline = self._timeline.judge(frame_id)
@@ -584,7 +578,7 @@ class Session:
 
     def _amend(self, message: schemas.Points, frame_id: FrameId, ticket: Any) -> list[Output]:
         """Put a cloud that came after its frame into the window."""
-        began_ns, frames = self._clock(), self._window.frames
+        began_ns, frames = time.perf_counter_ns(), self._window.frames
         placed = self._window.amended(message, frame_id, published=self._timeline.knows(frame_id))
         if all(new is old for new, old in zip(placed, frames, strict=True)):
             return []
@@ -622,7 +616,7 @@ class Session:
         if self.parameters.sensor_motion and self._estimated != self.session and self.density.sensor_motion is not None:
             self._estimated = self.session
             outputs.append(self._problems.no_pose(frame_id, self.density.sensor_motion))
-        step_ns = (self._clock() - began_ns) // max(1, len(outcomes))
+        step_ns = (time.perf_counter_ns() - began_ns) // max(1, len(outcomes))
         for one in outcomes:
             if (one.unknown or one.fault or one.tracks is None) and not one.frame.revision:
                 outputs += self._problems.left_out(one, self.parameters)

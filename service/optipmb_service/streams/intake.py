@@ -84,7 +84,7 @@ class Intake:
         self._inputs = inputs
         self._standby = standby
         self._linger_ns = round(linger_s * SECOND)
-        self._directory = streams.parts.directory
+        self._directory = streams.directory
         self._fusion = streams.parts.fusion
         self._keys = streams.parts.keys
         self._subscribed: set[Input] = set()

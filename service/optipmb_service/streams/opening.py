@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from optipmb_service.session.policy import Policy
     from optipmb_service.session.session import Session
     from optipmb_service.streams.backlog import Backlog
-    from optipmb_service.streams.parts import Parts
+    from optipmb_service.streams.streams import Streams
 
     Opened = Callable[[Session, int | None, bool], None]
 
@@ -36,14 +36,15 @@ class Opening:
     Messages wait in the backlog meanwhile.
 
     Args:
-        parts: of the process.
+        streams: of the process.
         policy: of the session.
         backlog: of the stream.
     """
 
-    def __init__(self, parts: Parts, policy: Policy, backlog: Backlog) -> None:
+    def __init__(self, streams: Streams, policy: Policy, backlog: Backlog) -> None:
         self._stream = backlog.session
-        self._parts = parts
+        self._streams = streams
+        self._parts = streams.parts
         self._policy = policy
         self._backlog = backlog
         self._incarnation: Incarnation | None = None
@@ -71,7 +72,7 @@ class Opening:
             first: a packet that was taken already.
             restore_only: whether a session begins only if one was kept, and not closed.
         """
-        self._incarnation = self._parts.admit(self._stream)
+        self._incarnation = self._streams.admit(self._stream)
         if self._incarnation is None:
             return False
         self._restore_only = restore_only
@@ -151,7 +152,7 @@ class Opening:
             session = self._restored(restored) if restored else self._new(incarnation, fence)
             opened(session, fence, restored is not None)
         else:
-            self._parts.admission.release(self._stream, incarnation)
+            self._streams.admission.release(self._stream, incarnation)
             self._parts.member.look()
         self._incarnation, self._restore_only = None, False
         self._proceed()

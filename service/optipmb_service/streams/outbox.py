@@ -83,7 +83,7 @@ class StreamOutbox:
         self._fixed_rate = self._parts.sessions.fixed_rate(self._stream)
         kinds = {"events": bool(self._policy.zones), "now": self._fixed_rate is not None}
         try:
-            self._publisher = self._parts.open_publisher(self._stream, **kinds)
+            self._publisher = self._parts.transport.open_publisher(self._stream, **kinds)
         except TransportError as error:
             log.warning("publisher_failed", stream=self._stream, error=str(error))
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from optipmb_service.session.arrivals import Arrivals
     from optipmb_service.session.session import Session
     from optipmb_service.streams.backlog import Backlog
+    from optipmb_service.streams.directory import StreamDirectory
     from optipmb_service.streams.parts import Parts
     from optipmb_service.streams.stream import Stream
     from optipmb_service.zenoh.inputs import Packet
@@ -36,12 +37,14 @@ class Sources:
 
     Args:
         parts: of the process.
+        directory: streams that are known.
         backlog: of the stream.
     """
 
-    def __init__(self, parts: Parts, backlog: Backlog) -> None:
+    def __init__(self, parts: Parts, directory: StreamDirectory, backlog: Backlog) -> None:
         self.log_check = LogCheck(round(parts.settings.lease_s * SECOND))
         self._parts = parts
+        self._directory = directory
         self._backlog = backlog
 
     def complete(self, session: Session, *caches: str) -> bool:
@@ -53,12 +56,12 @@ class Sources:
         arrivals.answer(*caches)
         if not arrivals.waiting or not fusion.is_session(name):
             return arrivals.waiting
-        awaited = self._parts.directory.awaited(
+        awaited = self._directory.awaited(
             fusion.feeds(name), lambda one: fusion.session_of(one) == name, session.sensors, now_ns
         )
         for stream in arrivals.to_ask(awaited):
             with contextlib.suppress(TransportError):  # the end
-                self._parts.ask_cache(stream, partial(self._arrived, arrivals, stream))
+                self._parts.transport.ask_cache(stream, partial(self._arrived, arrivals, stream))
         return arrivals.complete(awaited, now_ns)
 
     def look_in_log(self, stream: Stream) -> None:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from optipmb_service.session.outputs import Output
     from optipmb_service.session.session import Session
     from optipmb_service.streams.backlog import Backlog
-    from optipmb_service.streams.parts import Parts
+    from optipmb_service.streams.streams import Streams
 
 log = structlog.get_logger("optipmb_service")
 
@@ -49,11 +49,12 @@ class Stream:
     """Session of a sensor, or of several.
 
     Args:
-        parts: of the process.
+        streams: of the process.
         backlog: its waiting messages.
     """
 
-    def __init__(self, parts: Parts, backlog: Backlog) -> None:
+    def __init__(self, streams: Streams, backlog: Backlog) -> None:
+        parts = streams.parts
         self.name = backlog.session
         self.backlog = backlog
         self.session: Session | None = None
@@ -62,14 +63,15 @@ class Stream:
         self.sensors = SensorMeters(self.name, self.meter, parts)
         self.policy = parts.sessions.policy(self.name)
         self.outbox = StreamOutbox(self.name, parts, self.policy, self.meter)
-        self.opening = Opening(parts, self.policy, backlog)
-        self.sources = Sources(parts, backlog)
+        self.opening = Opening(streams, self.policy, backlog)
+        self.sources = Sources(parts, streams.directory, backlog)
+        self._streams = streams
         self._parts = parts
         self._member = parts.member
         self._prefix = f"{parts.keys.prefix}/"
         self._changed = False
         self._armed_ns: int | None = None
-        backlog.attach(partial(parts.submit, self.work), self.on_answered)
+        backlog.attach(partial(parts.scheduler.submit, self.work), self.on_answered)
         self.counts = StreamCounters(backlog)
 
     # A turn
@@ -93,7 +95,7 @@ class Stream:
             self._guard(self._settle)
         turn = backlog.end_turn(close=not self.occupied, urgent=paused)
         if turn is None:
-            self._parts.discard(self)
+            self._streams.discard(self)
         return bool(turn)
 
     def tell(self, command: Callable[[Stream], None]) -> None:
@@ -190,7 +192,7 @@ class Stream:
             self.backlog.open(packet)
             self.backlog.leave()
         elif self._read(packet) is not None:
-            why = self._parts.admission.room(self.name)
+            why = self._streams.admission.room(self.name)
             if why or not self.opening.begin(self._on_opened, packet):
                 self.counts.refuse(None, frame=packet.frame)
             if why:
@@ -249,7 +251,7 @@ class Stream:
             self.backlog.open()
         elif (
             self.session is not None
-            or self._parts.admission.room(self.name)
+            or self._streams.admission.room(self.name)
             or not self.opening.begin(self._on_opened, restore_only=True)
         ):
             self.backlog.go_live()
@@ -333,7 +335,7 @@ class Stream:
         self.session, self._armed_ns = None, None
         self.outbox.close()
         self.counts.close()
-        self._parts.admission.release(self.name, session.incarnation)
+        self._streams.admission.release(self.name, session.incarnation)
         log.info(
             "session_closed", stream=self.name, session=session.session, reason=reason, frames=session.counters.frames
         )

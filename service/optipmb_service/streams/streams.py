@@ -11,40 +11,29 @@ import threading
 import time
 from functools import lru_cache, partial
 from itertools import islice
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import optipmb_schemas as schemas
 
-import optipmb
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.session.counts import MessageCounters
 from optipmb_service.session.policy import SECOND
 from optipmb_service.streams.admission import Admission
 from optipmb_service.streams.backlog import MEGABYTE, Backlog, BacklogBounds, ByteBudget
 from optipmb_service.streams.directory import StreamDirectory
-from optipmb_service.streams.parts import Parts
-from optipmb_service.streams.profiles import FUSED, Fusion
+from optipmb_service.streams.profiles import FUSED
 from optipmb_service.streams.rivals import Rivals
-from optipmb_service.streams.session_factory import PARTS, SessionFactory
+from optipmb_service.streams.session_factory import PARTS
 from optipmb_service.streams.sources import read_logs
 from optipmb_service.streams.stream import Stream
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator
 
-    from optipmb_service.cluster.member import Member
     from optipmb_service.session.checkpoint import Checkpoint
     from optipmb_service.session.identity import Incarnation
-    from optipmb_service.settings import Settings
-    from optipmb_service.streams.persistence import CheckpointWriter
-    from optipmb_service.streams.profiles import Profiles
-    from optipmb_service.streams.recovery import Log
-    from optipmb_service.streams.scheduler import Scheduler
-    from optipmb_service.streams.traces import Traces
-    from optipmb_service.telemetry.metrics import Metrics
-    from optipmb_service.telemetry.problem_reporter import ProblemReporter
+    from optipmb_service.streams.parts import Parts
     from optipmb_service.zenoh.inputs import Packet
-    from optipmb_service.zenoh.transport import StreamPublisher
 
 MAX_UNPROVEN: Final = 256
 """Streams at once that have not sent a valid message yet."""
@@ -80,66 +69,24 @@ It would free next to nothing. All such sessions keep less than a tenth of the m
 
 
 class Streams:
-    """The streams of one process, and their common parts.
+    """The streams of one process."""
 
-    Args:
-        settings: in force.
-        profiles: the parameters that can be had.
-        tracker: makes the trackers of sessions.
-        scheduler: runs the streams.
-
-    The others are the attributes of `Parts`.
-    """
-
-    def __init__(  # noqa: PLR0913 - the parts that it brings together
-        self,
-        settings: Settings,
-        profiles: Profiles,
-        *,
-        open_publisher: Callable[..., StreamPublisher],
-        ask_cache: Callable[[str, Callable[[list[Packet], bool], None]], None],
-        reporter: ProblemReporter,
-        scheduler: Scheduler,
-        member: Member,
-        checkpoints: CheckpointWriter,
-        log: Log | None,
-        arm: Callable[[Callable[[], None], int], None],
-        metrics: Metrics,
-        tracker: Callable[[optipmb.Parameters], Any] = optipmb.Tracker,
-        traces: Traces | None = None,
-    ) -> None:
-        fusion = Fusion.of(settings)
-        self.parts = Parts(
-            settings=settings,
-            keys=schemas.Keys(settings.prefix),
-            limits=settings.limits.limits(),
-            fusion=fusion,
-            sessions=SessionFactory(settings, profiles, fusion, tracker, self._report),
-            admission=Admission(settings, self._used, self._evict_for_another),
-            directory=StreamDirectory(
-                settings.instance,
-                round(settings.idle_s * SECOND),
-                lambda stream: self.tracked(fusion.session_of(stream)),
-            ),
-            member=member,
-            checkpoints=checkpoints,
-            log=log,
-            reporter=reporter,
-            metrics=metrics,
-            traces=traces,
-            open_publisher=open_publisher,
-            ask_cache=ask_cache,
-            submit=scheduler.submit,
-            arm=arm,
-            admit=self.admit,
-            discard=self.discard,
+    def __init__(self, parts: Parts) -> None:
+        self.parts = parts
+        self._settings = settings = parts.settings
+        self._member = parts.member
+        self.admission = Admission(settings, self._used, self._evict_for_another)
+        """Room for sessions."""
+        self.directory = StreamDirectory(
+            settings.instance,
+            round(settings.idle_s * SECOND),
+            lambda stream: self.tracked(parts.fusion.session_of(stream)),
         )
+        """Streams that are known."""
         self.queued = ByteBudget(settings.memory_mb * MEGABYTE // 2)
         """Bytes that wait in the queues of all streams."""
         self.parsed = lru_cache(MAX_KEYS)(self._parsed)
         """Returns the stream of a key and its session, or raises MessageError."""
-        self._settings = settings
-        self._member = member
         self._rivals = Rivals(settings.instance, round(RIVAL_LEASES * settings.lease_s * SECOND))
         self._bounds = BacklogBounds(
             self._lose,
@@ -181,7 +128,7 @@ class Streams:
             self._push(session, packet, own=False)
             return
         self.parts.metrics.received(topic, packet.size)
-        if exceeded := self.parts.admission.exceeded(stream, packet.size, packet.now_ns):
+        if exceeded := self.admission.exceeded(stream, packet.size, packet.now_ns):
             self._refuse("quota", packet, stream, exceeded, "more")
         else:
             self._push(session, packet, own=True)
@@ -406,7 +353,7 @@ class Streams:
         """Have every session that changed give its state to the checkpoint writer."""
         changed = [stream for stream in self._all() if stream.changed]  # thousands may be silent
         if changed:
-            self.parts.submit(partial(self._keep_some, iter(changed)))
+            self.parts.scheduler.submit(partial(self._keep_some, iter(changed)))
 
     @staticmethod
     def _keep_some(changed: Iterator[Stream]) -> bool:
@@ -509,7 +456,7 @@ class Streams:
 
     def admit(self, session: str) -> Incarnation | None:
         """Count a session that begins; return the stream's last incarnation, None when there is no room."""
-        incarnation = self.parts.admission.admit(session)
+        incarnation = self.admission.admit(session)
         if incarnation is not None:
             self._let_in()
         return incarnation
@@ -572,7 +519,7 @@ class Streams:
         return backlog
 
     def _attach(self, backlog: Backlog) -> Stream:
-        stream = self._streams[backlog.session] = Stream(self.parts, backlog)
+        stream = self._streams[backlog.session] = Stream(self, backlog)
         self._unproven.add(stream)
         return stream
 

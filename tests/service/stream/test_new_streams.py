@@ -125,8 +125,8 @@ def member_of(network: Network, held: set[int]) -> tuple[Intake, Any]:
         take_up=lambda *_: None,
         changed=lambda *_: None,
     )
-    known = directory.StreamDirectory("m", 3600 * SECOND, streams.tracked)
-    streams.parts = SimpleNamespace(keys=KEYS, fusion=Fusion(), directory=known)
+    streams.directory = directory.StreamDirectory("m", 3600 * SECOND, streams.tracked)
+    streams.parts = SimpleNamespace(keys=KEYS, fusion=Fusion())
     untyped: Any = streams, Holding(held), network
     return Intake(*untyped, standby=False, linger_s=10.0), streams
 
