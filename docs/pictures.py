@@ -22,7 +22,7 @@ from optipmb_tools.cli import run
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.run import profiles
 from optipmb_tools.run.rejoining import RejoinOptions, tracklets
-from optipmb_tools.run.tracking import track_whole
+from optipmb_tools.run.tracking import Tracking, track_whole
 from sites import View, circle, copied, plaza
 
 import optipmb
@@ -312,7 +312,7 @@ def draw_gap(axes: Axes) -> None:
         behind_a_building(table)
         (sequence,) = open_dataset("table", table).sequences(["all"])
         parameters = profiles.profile_for("auto", [sequence])
-        tracks = track_whole(parameters, sequence).tracks
+        tracks = track_whole(Tracking(parameters), sequence).tracks
     found, objects = tracklets(tracks, parameters.labels), RejoinOptions().objects(tracks, parameters)
     object_of = dict(zip(objects.id.tolist(), objects.object.tolist(), strict=True))
     earlier, later = np.flatnonzero([parameters.labels[one] == "car" for one in found.label.tolist()]).tolist()

@@ -14,7 +14,7 @@ from optipmb_tools.datasets.table import TableDataset
 from optipmb_tools.datasets.table.findings import Claim, Finding, Reading
 from optipmb_tools.results.output import TrackCounts
 from optipmb_tools.run.profiles import profile_for
-from optipmb_tools.run.tracking import track_whole
+from optipmb_tools.run.tracking import Tracking, track_whole
 from optipmb_tools.table_files import write_table
 from own_tables import boxes
 from streets import CARS, PERIOD, Table, street
@@ -504,7 +504,8 @@ def test_objects_that_report_one_by_one_are_looks_at_each(tmp_path: Path) -> Non
     frame = next(dataset.sequences(["all"])[0].frames())
     assert frame.field_of_view is not None
     assert frame.pose.translation[:2] == pytest.approx([columns["x"][0], columns["y"][0]])
-    tracks = track_whole(profile_for("auto", dataset.sequences(["all"])), dataset.sequences(["all"])[0]).tracks
+    (sequence,) = dataset.sequences(["all"])
+    tracks = track_whole(Tracking(profile_for("auto", [sequence])), sequence).tracks
     assert TrackCounts.of(tracks.values()).tracks == 5
     stamps = looked(tmp_path / "d.csv", columns, group="2.3")[0].sequences(["all"])[0].stamps
     assert 25 < len(stamps) < 45

@@ -15,7 +15,7 @@ from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.datasets.fused import FusedSequence
 from optipmb_tools.recordings.files import RecordingWriter
 from optipmb_tools.run.profiles import read_sensors
-from optipmb_tools.run.tracking import track_whole
+from optipmb_tools.run.tracking import Tracking, track_whole
 from sessions import Merged
 
 import optipmb
@@ -69,7 +69,7 @@ def tabled(path: Path, frames: list[Detections]) -> Path:
 
 def same(sequence: FusedSequence, wanted: list[Tracks], sensors: optipmb.Sensors = ALIKE) -> None:
     """Check that the tracks of a sequence equal a service's, byte for byte."""
-    found = track_whole(KITTI, sequence, sensors=sensors).tracks.values()
+    found = track_whole(Tracking(KITTI, sensors=sensors), sequence).tracks.values()
     assert len(found) == len(wanted)
     for ours, theirs in zip(found, wanted, strict=True):
         for name in COLUMNS:

@@ -54,7 +54,7 @@ def test_tracks_are_confirmed_as_asked(
     """Existence, `confirmed` and velocity are in hindsight, where there is one, by any number of rows."""
     monkeypatch.setattr(tracking, "ROWS", together)
     (sequence,), parameters = dataset.sequences(["0000"]), read_profile("scene")
-    plain = track_whole(parameters, sequence)
+    plain = track_whole(Tracking(parameters), sequence)
     found, shown = decided(plain, Tracking(parameters, **how)), how.get("show")
     columns = with_hindsight(list(plain.tracks.values()), parameters, velocity_s=0.5, show=shown)
     for (index, one), changed in zip(found.items(), columns, strict=True):
@@ -68,7 +68,7 @@ def test_result_files_come_with_those_of_the_tracks_that_are_shown(dataset: Data
     """The same file in a folder beside it has the confirmed rows, by which an evaluation tells them."""
     (sequence,), how = dataset.sequences(["0000"]), Tracking(read_profile("scene"), hindsight_s=1.0)
     (result,) = track(dataset, [sequence], tmp_path, how)
-    found = decided(track_whole(how.parameters, sequence), how)
+    found = decided(track_whole(how, sequence), how)
     wanted = [(k, i) for k, one in found.items() for i in one.id[one.confirmed > 0].tolist()]
     every, shown = (
         [tuple(map(int, line.split()[:2])) for line in path.read_text().splitlines()]
@@ -139,13 +139,13 @@ def test_values_that_the_tracker_refuses_are_placed(dataset: Dataset) -> None:
     loaded = Preloaded(sequence)
     loaded._frames[3] = replace(loaded._frames[3], score=loaded._frames[3].score + 1.0)
     with pytest.raises(UsageError, match=r"sequence 0000, frame 3: score"):
-        track_whole(read_profile("kitti"), loaded)
+        track_whole(Tracking(read_profile("kitti")), loaded)
 
 
 def test_spooled_tracks_are_those_that_were_added(dataset: Dataset) -> None:
     """In a file and in memory, in any order, with other values of a column, and as a table."""
     (sequence,), parameters = dataset.sequences(["0000"]), read_profile("scene")
-    frames = list(track_whole(parameters, sequence).tracks.values())
+    frames = list(track_whole(Tracking(parameters), sequence).tracks.values())
     spooled, count = SpooledTracks(), 2 * BLOCK + 90
     for index in reversed(range(count)):
         spooled.add(index, frames[index % len(frames)])

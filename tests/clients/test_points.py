@@ -15,7 +15,7 @@ from optipmb_tools.evaluation import default_rules
 from optipmb_tools.evaluation.cases import prepare
 from optipmb_tools.evaluation.clear import clear, combine
 from optipmb_tools.files import DatasetError
-from optipmb_tools.run.tracking import track_whole
+from optipmb_tools.run.tracking import Tracking, track_whole
 from optipmb_tools.table_files import read_table, write_table
 from optipmb_tools.tuning.clips import Clip, load, track_clip
 from optipmb_tools.tuning.scoring import rules_of
@@ -74,7 +74,7 @@ def test_points_are_smoothed_while_their_heading_is_known(tmp_path: Path) -> Non
     write_table(tmp_path / "points.csv", boxes(**UNKNOWN))
     (sequence,) = TableDataset(tmp_path / "points.csv").sequences(["all"])
     parameters = optipmb.load_profile("generic")
-    plain, smooth = (track_whole(parameters, sequence, smooth=one).tracks for one in (False, True))
+    plain, smooth = (track_whole(Tracking(parameters, smooth=one), sequence).tracks for one in (False, True))
     changed = 0
     for index, before in plain.items():
         after = smooth[index]

@@ -14,7 +14,7 @@ from optipmb_tools.geometry import Floats, Ints, Pose, planar_pose, wrap_angle
 from optipmb_tools.results import full_table
 from optipmb_tools.results.kitti import SUBMISSION_SCORES, read_kitti_results, write_kitti_results
 from optipmb_tools.run.profiles import profile_for
-from optipmb_tools.run.tracking import track_whole
+from optipmb_tools.run.tracking import Tracking, track_whole
 from real_data import kitti_root
 
 LABELS = ("Car", "Pedestrian", "Cyclist")
@@ -168,7 +168,7 @@ def test_a_submission_has_confirmed_tracks_of_high_mean_score_in_the_image(
     least = float(options[0]) if options else SUBMISSION_SCORES["Car"]
     assert f"confirmed tracks from these mean scores on, in the image: Car {least:g}" in done.stderr
     (sequence,) = open_dataset("kitti", tmp_path).sequences(["all"])
-    found = track_whole(profile_for("auto", [sequence]), sequence).tracks.values()
+    found = track_whole(Tracking(profile_for("auto", [sequence])), sequence).tracks.values()
     confirmed = {int(one) for tracks in found for one in tracks.id[tracks.confirmed == 1]}
     every, cut = submitted(tmp_path / "all/0000.txt"), submitted(tmp_path / "cut/0000.txt")
     assert 3 < len(confirmed) <= len(every)

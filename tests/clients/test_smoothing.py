@@ -15,7 +15,7 @@ from optipmb_tools.datasets import DataSequence, Preloaded, open_dataset
 from optipmb_tools.geometry import wrap_angle
 from optipmb_tools.run.profiles import read_profile
 from optipmb_tools.run.smoothing import smooth
-from optipmb_tools.run.tracking import track_whole
+from optipmb_tools.run.tracking import Tracking, track_whole
 
 from optipmb import load_profile, parse_parameters
 from optipmb.filter.lightweight import turn_around
@@ -64,7 +64,7 @@ def test_states_are_smoothed_as_the_article_has_it(*, turned: bool) -> None:
 
 
 def tracked(sequence: DataSequence, *, smooth: bool) -> dict[int, Tracks]:
-    return track_whole(read_profile("kitti"), sequence, smooth=smooth).tracks
+    return track_whole(Tracking(read_profile("kitti"), smooth=smooth), sequence).tracks
 
 
 def errors(sequence: DataSequence, tracks: dict[int, Tracks]) -> Iterator[tuple[float, float]]:
@@ -118,7 +118,7 @@ def test_the_factors_of_a_calibration_hold_for_smoothed_states(sequence: DataSeq
         document = read_profile("kitti").model_dump()
         for own in document["classes"].values():
             own["calibration"] = (own["calibration"] or LEVEL) | {"speed": speed, "turn_rate": turn_rate}
-        found.append(track_whole(parse_parameters(document), sequence, smooth=True).tracks)
+        found.append(track_whole(Tracking(parse_parameters(document), smooth=True), sequence).tracks)
     for one, scaled in zip(*(tracks.values() for tracks in found), strict=True):
         np.testing.assert_allclose(scaled.covariance, one.covariance * np.outer(factors, factors), rtol=1e-6, atol=1e-9)
         for name in ("center", "yaw", "velocity"):

@@ -10,7 +10,7 @@ from commands import result_of, run_here
 from optipmb_tools.datasets import DataSequence, DatasetError, open_dataset
 from optipmb_tools.datasets.table import TableDataset, TableSequence, match_stamps
 from optipmb_tools.datasets.table.columns import find_columns
-from optipmb_tools.run.tracking import track_whole
+from optipmb_tools.run.tracking import Tracking, track_whole
 from optipmb_tools.table_files import read_table, write_table
 from own_tables import FRAMES, boxes
 
@@ -197,7 +197,7 @@ def test_columns_of_covariances_are_those_of_the_positions(tmp_path: Path) -> No
         assert np.isnan(found[2]).all()
     kitti = load_profile("kitti")
     noisy, plain = (
-        list(track_whole(kitti, one).tracks.values())
+        list(track_whole(Tracking(kitti), one).tracks.values())
         for one in (sequence, only(TableDataset(table(tmp_path / "b.csv", boxes()))))
     )
     assert noisy[-1].covariance[1, 0, 0] > 1.2 * plain[-1].covariance[1, 0, 0]

@@ -19,7 +19,7 @@ from optipmb_tools.tuning.values import (
 import optipmb
 
 pytest.importorskip("optuna")
-from optipmb_tools.tuning.study import Dimension, Plan, dimensions, repaired, search
+from optipmb_tools.tuning.study import Dimension, Plan, dimensions, opened, repaired, search
 
 SPACE = (*(Dimension(f"d{i}", "log", 0.1, 10.0, 1.0) for i in range(5)), Dimension("n", "whole", 1, 100, 30))
 START = {one.path: one.value(one.start) for one in SPACE}
@@ -41,7 +41,7 @@ def searched(
         return score(values)
 
     plan = Plan(trials=trials, seed=seed)
-    return search(path, "valley", {"a": settings}, SPACE, [START, {"d0": 2.0}], noted, plan), asked
+    return search(opened(path, "valley", {"a": settings}), SPACE, [START, {"d0": 2.0}], noted, plan), asked
 
 
 def test_an_interrupted_study_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:

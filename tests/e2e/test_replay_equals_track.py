@@ -12,7 +12,7 @@ from optipmb_service.session.outputs import TrackedFrame
 from optipmb_service.session.session import Session
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.recordings.files import RecordingWriter
-from optipmb_tools.run.tracking import track_whole
+from optipmb_tools.run.tracking import Tracking, track_whole
 from router import Sensor
 from service_process import ServiceProcess
 
@@ -126,7 +126,7 @@ def test_a_recording_of_a_publisher_of_the_world_frame(
             writer.add(key, encode(message), encoding_of(message), seq)
             expected += [one.tracks for one in session.on_detections(message, 0) if isinstance(one, TrackedFrame)]
     (sequence,) = open_dataset("mcap", path).sequences(["all"])
-    found = list(track_whole(parameters, sequence).tracks.values())
+    found = list(track_whole(Tracking(parameters), sequence).tracks.values())
     assert len(found) == len(expected) == 30
     assert len(found[-1].id) >= 8
     for offline, online in zip(found, expected, strict=True):

@@ -20,7 +20,7 @@ from optipmb_service.app import cli
 from optipmb_service.edges.ros2 import graph
 from optipmb_tools.datasets import DataSequence, open_dataset
 from optipmb_tools.run.profiles import read_profile
-from optipmb_tools.run.tracking import track_whole
+from optipmb_tools.run.tracking import Tracking, track_whole
 from ros2_client import Ros2Client, hash_by_sdk
 from router import until
 from routers import open_client
@@ -192,7 +192,7 @@ def test_topics_become_tracks_of_another_node(robot: Robot, scene: DataSequence,
     assert {len(path.path) for path in paths_of(predicted[-1])} == {7}
     assert ids(of_humble) == ids(tracked[-1])
     assert process.process.poll() is not None
-    expected = track_whole(read_profile("scene"), scene).tracks.values()
+    expected = track_whole(Tracking(read_profile("scene")), scene).tracks.values()
     assert sum(len(tracks.id) for tracks in expected) > 30
     for index, (message, tracks) in enumerate(zip(tracked, expected, strict=True)):
         assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == START_NS + index * 10**8

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class MatchingOptions:
-    """Options of how boxes are compared, and figures drawn."""
+    """Options of how tracks and boxes are compared, and figures drawn."""
 
     iou: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="Boxes match from this 3D intersection over union on.")
@@ -43,6 +43,14 @@ class MatchingOptions:
     ] = None
     cutoff: Annotated[float, typer.Option(min=0.01, help="Cut-off distance of GOSPA and OSPA, in metres.")] = 2.0
     order: Annotated[float, typer.Option(min=1.0, help="Order of GOSPA and OSPA.")] = 2.0
+    by: Annotated[
+        str,
+        typer.Option(
+            "--by",
+            metavar="id|object",
+            help="Column of a table of tracks that names them: with object, tracks that track --rejoin joined are one.",
+        ),
+    ] = "id"
     plot: Annotated[
         Path | None, typer.Option("--plot", help="With several --tracks: also draw their figures, as a .png.")
     ] = None
@@ -58,6 +66,14 @@ class MatchingOptions:
         if self.distance is not None:
             return default_rules(dataset, "distance", self.distance)
         return default_rules(dataset)
+
+    def column(self) -> "By":
+        """Return the column of a table that names its tracks."""
+        if self.by == "object":
+            return "object"
+        if self.by != "id":
+            raise UsageError(f"--by: expected id or object, received {self.by}")
+        return "id"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,14 +101,6 @@ def evaluate(
     ] = None,
     how: MatchingOptions,
     jobs: EvaluationJobs,
-    by: Annotated[
-        str,
-        typer.Option(
-            "--by",
-            metavar="id|object",
-            help="Column of a table of tracks that names them: with object, tracks that track --rejoin joined are one.",
-        ),
-    ] = "id",
     every: All = False,
     as_json: AsJson = False,
 ) -> None:
@@ -114,14 +122,11 @@ def evaluate(
         data = dataclasses.replace(data, data=data.truth, truth=None)  # a table of objects is its own truth
     more = {"tracks": " ".join(map(str, tracks))} if data.named()[0] == "table" else {}
     opened = data.open(**more)
-    column = _column(by)
     spelt = {label.lower(): label for label in opened.labels}
     names = tuple(one if one in opened.labels else spelt.get(one.lower(), one) for one in classes or opened.labels)
     note = cache(warn)  # prints each assumption once
     with jobs.executor(opened.frames, max(1, len(names))) as executor:
-        reports = {
-            str(one): _evaluated(opened, one, names, how, executor, note, every=every, by=column) for one in tracks
-        }
+        reports = {str(one): _evaluated(opened, one, names, how, executor, note, every=every) for one in tracks}
     for tables in (one.tables for one in opened.sequences if hasattr(one, "tables")):
         tables.check()
     report = {"command": "evaluate", "dataset": opened.name, "sequences": opened.names}
@@ -145,14 +150,6 @@ def evaluate(
         shown = comparison_tables(compared) if others else first.tables
         for table in shown:
             print_table(table)
-
-
-def _column(by: str) -> "By":
-    if by == "object":
-        return "object"
-    if by != "id":
-        raise UsageError(f"--by: expected id or object, received {by}")
-    return "id"
 
 
 @dataclass(frozen=True)
@@ -199,7 +196,6 @@ def _evaluated(
     note: Callable[[str], None],
     *,
     every: bool,
-    by: "By",
 ) -> _Evaluated:
     from optipmb_tools.commands.tables import figure_tables, shown_table  # noqa: PLC0415  as above
     from optipmb_tools.evaluation import evaluate_files  # noqa: PLC0415  as above
@@ -210,14 +206,14 @@ def _evaluated(
         figures_of,
     )
 
-    asked = opened.dataset.arguments
+    asked, by = opened.dataset.arguments, how.column()
     settings = (
         FigureOptions((how.iou,), how.cutoff, how.order)
         if how.iou
         else FigureOptions(cutoff=how.cutoff, order=how.order)
     )
     if opened.name == "nuscenes" and asked.root is not None:
-        protocol = _nuscenes(asked.root, opened.names, tracks, names, how, by)
+        protocol = _nuscenes(asked.root, opened.names, tracks, names, how)
     else:
         results = evaluate_files(opened.sequences, tracks, names, how.rules(opened.name), note, by=by)
         protocol = (_kitti if opened.name == "kitti" else _clear_mot)(results, how, every=every)
@@ -262,15 +258,15 @@ def _kitti(results: "Sequence[ClassResult]", how: MatchingOptions, *, every: boo
 
 
 def _nuscenes(
-    root: Path, sequences: list[str], tracks: Path, names: tuple[str, ...], how: MatchingOptions, by: "By"
+    root: Path, sequences: list[str], tracks: Path, names: tuple[str, ...], how: MatchingOptions
 ) -> _Protocol:
     from optipmb_tools.commands.tables import nuscenes_table  # noqa: PLC0415  as above
     from optipmb_tools.evaluation.nuscenes import evaluate_nuscenes  # noqa: PLC0415  as above
 
     if how.iou is not None or how.distance is not None:
         raise UsageError("--iou and --distance: the benchmark of nuScenes has its own rules")
-    if by != "id":
-        raise UsageError(f"--by {by}: the result files of nuScenes have no such column")
+    if how.column() != "id":
+        raise UsageError(f"--by {how.by}: the result files of nuScenes have no such column")
     scores = evaluate_nuscenes(root, tracks, sequences)
     parts = {name: {"nuscenes": one.to_json()} for name, one in scores.classes.items() if name in names}
     best = {name: scores.classes[name].best.threshold for name in parts}

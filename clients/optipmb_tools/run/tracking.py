@@ -81,6 +81,23 @@ class Tracked:
     seconds: float
 
 
+@dataclass(frozen=True)
+class Tracking:
+    """How sequences are tracked."""
+
+    parameters: Parameters
+    classes: Sequence[str] = ()  # only detections of these; empty: all
+    modules: Modules | None = None
+    full: bool = False  # also write all columns of the tracks
+    smooth: bool = False  # estimate states from all frames of their track (`optipmb_tools.run.smoothing`)
+    hindsight_s: float = 0.0  # time after a frame that tells its velocities (`learning.hindsight`); 0: no hindsight
+    show: float | None = None  # existence from which tracks are confirmed; None: as the profile says
+    sensors: Sensors = ALIKE  # how frames that name their sensor are used
+    rejoin: "RejoinOptions | None" = None  # join tracks over gaps (`optipmb_tools.run.rejoining`)
+    ids: str = "track"  # what ids are in the results: of the track, or of its object (`object`)
+    view: Path | None = None  # page of the tracks, of one sequence
+
+
 def tracker_frame(parameters: Parameters, sequence: str, given: DetectionFrame) -> Frame:
     """Return a frame of a sequence for the tracker.
 
@@ -120,24 +137,21 @@ def _trackers(
 
 
 def track_whole(
-    parameters: Parameters,
+    how: Tracking,
     sequence: DataSequence,
-    classes: Sequence[str] = (),
-    modules: Modules | None = None,
     *,
-    sensors: Sensors = ALIKE,
-    smooth: bool = False,
-    on_frame: Callable[[], None] = lambda: None,
+    on_frame: Callable[[], None] = _ignored,
     sensor: NDArray[np.float64] | None = None,
 ) -> Tracked:
-    """Track one sequence, with `smooth` so that states are given all frames of their track.
+    """Track one sequence. Tracks are not yet decided in hindsight, and not joined.
 
-    Frames that name their sensor are used as `sensors` say. `sensor`: `Density.sensor` before the first frame.
+    `sensor`: `Density.sensor` before the first frame.
 
     Raises:
         UsageError: A frame holds values that the tracker refuses.
         DatasetError: The sequence cannot be read.
     """
+    parameters = how.parameters
     _warm()
     begun = time.monotonic()
     found = SpooledTracks()
@@ -148,15 +162,15 @@ def track_whole(
     size = len(parameters.classes)
     given, low = np.zeros(size, np.int64), np.zeros(size, np.int64)
     smoother = None
-    if smooth:
+    if how.smooth:
         from optipmb_tools.run.smoothing import Smoother  # noqa: PLC0415  of --smooth alone
 
         smoother = Smoother(parameters)
     # A smoother joins the frames of a track, which an estimated motion has in axes of their own.
-    followed = parameters.model_copy(update={"sensor_motion": False}) if smooth else parameters
-    used = _trackers(followed, modules, sensors)
+    followed = parameters.model_copy(update={"sensor_motion": False}) if how.smooth else parameters
+    used = _trackers(followed, how.modules, how.sensors)
     density = replace(Density.empty(parameters.labels), sensor=sensor)
-    for frame in selected_frames(sequence, classes):
+    for frame in selected_frames(sequence, how.classes):
         own, tracker, least = used(frame.sensor)
         taken = tracker_frame(own, sequence.name, frame)
         started = time.perf_counter_ns()
@@ -248,23 +262,6 @@ class TrackedSequence:
     step: Latency | None  # durations of the tracker's steps
 
 
-@dataclass(frozen=True)
-class Tracking:
-    """How sequences are tracked."""
-
-    parameters: Parameters
-    classes: Sequence[str] = ()  # only detections of these; empty: all
-    modules: Modules | None = None
-    full: bool = False  # also write all columns of the tracks
-    smooth: bool = False  # estimate states from all frames of their track (`optipmb_tools.run.smoothing`)
-    hindsight_s: float = 0.0  # time after a frame that tells its velocities (`learning.hindsight`); 0: no hindsight
-    show: float | None = None  # existence from which tracks are confirmed; None: as the profile says
-    sensors: Sensors = ALIKE  # how frames that name their sensor are used
-    rejoin: "RejoinOptions | None" = None  # join tracks over gaps (`optipmb_tools.run.rejoining`)
-    ids: str = "track"  # what ids are in the results: of the track, or of its object (`object`)
-    view: Path | None = None  # page of the tracks, of one sequence
-
-
 def decided(tracked: Tracked, how: Tracking) -> SpooledTracks:
     """Return the tracks by frame index, confirmed as `how` says; velocities change where all frames have equal axes."""
     found = tracked.tracks
@@ -327,11 +324,9 @@ def _track_one(job: _Job, name: str) -> tuple[TrackedSequence, Path | Iterable[C
     """Track one sequence and write its results; idempotent. Return the rows where all sequences share one table."""
     dataset, how = job.dataset, job.how
     sequence = job.sequences[name] if name in job.sequences else dataset.sequences([name])[0]
-    options: dict[str, Any] = {"sensors": how.sensors, "smooth": how.smooth, "on_frame": job.on_frame}
-    found = track_whole(how.parameters, sequence, how.classes, how.modules, **options)
+    found = track_whole(how, sequence, on_frame=job.on_frame)
     if how.hindsight_s and found.on_vehicle:  # also before its frames showed it
-        options |= {"on_frame": _ignored, "sensor": UNKNOWN_MOTION}
-        found = track_whole(how.parameters, sequence, how.classes, how.modules, **options)
+        found = track_whole(how, sequence, sensor=UNKNOWN_MOTION)
     if how.rejoin is not None and found.estimated:
         expected = "expected boxes in a world frame, or poses of the sensor"
         raise UsageError(f"--rejoin: sequence {name}: {expected}; here the motion of the sensor is estimated")

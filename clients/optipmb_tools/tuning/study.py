@@ -189,7 +189,8 @@ def tune(
         candidate = with_values(base, name, repaired(values, base, name))
         return objective.value(objective.figures(candidate, clips), clips)
 
-    best = repaired(search(storage, name, settings, space, [{}, estimated], score, plan, display.trial), base, name)
+    kept = opened(storage, name, settings)
+    best = repaired(search(kept, space, [{}, estimated], score, plan, display.trial), base, name)
     chosen = {path: value for path, value in best.items() if value != value_of(base, name, path)}
     display.note(f"calibrating {name}")
     found = _calibrated(objective, with_values(base, name, chosen), clips)
@@ -225,9 +226,7 @@ def _calibrated(objective: Objective, parameters: Parameters, clips: tuple[int, 
 
 
 def search(
-    storage: Path,
-    name: str,
-    settings: Mapping[str, Any],
+    kept: "optuna.Study",
     space: Sequence["Dimension"],
     starts: Sequence[Values],
     score: Callable[[Values], float],
@@ -237,20 +236,16 @@ def search(
     """Continue a study until it has the trials of the plan; return the values of the best, the earliest of equals.
 
     Args:
-        storage: the file, which has a study for each name.
-        name: of the study.
-        settings: on which the trials depend.
+        kept: the study in its file, which gets whole trials only: each takes a dozen writes, which go to memory.
         space: the values that are searched.
         starts: the candidates tried first; a value that one lacks is the start's.
         score: is maximised.
         plan: has the number of trials and the seed.
         on_trial: gets the best score after each trial.
-
-    Raises:
-        ClientError: Optuna is not installed.
-        UsageError: the file has a study of this name with other settings.
     """
-    optuna, kept, study = _opened(storage, name, settings)
+    optuna = _load_optuna()
+    study = optuna.create_study(direction="maximize")
+    study.add_trials(kept.get_trials(deepcopy=False))
 
     def scored(trial: Any) -> float:
         return score({one.path: one.suggest(trial) for one in space})
@@ -261,7 +256,7 @@ def search(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # multivariate has been experimental for years
             study.sampler = optuna.samplers.TPESampler(
-                seed=zlib.crc32(f"{plan.seed} {name} {number}".encode()), multivariate=True
+                seed=zlib.crc32(f"{plan.seed} {kept.study_name} {number}".encode()), multivariate=True
             )
         study.optimize(scored, n_trials=1)
         kept.add_trial(study.trials[-1])
@@ -270,10 +265,12 @@ def search(
     return {one.path: one.value(best.params[one.path]) for one in space}
 
 
-def _opened(storage: Path, name: str, settings: Mapping[str, Any]) -> tuple[Any, Any, Any]:
-    """Return Optuna, the study in a file, which several studies share, and the same in memory.
+def opened(storage: Path, name: str, settings: Mapping[str, Any]) -> Any:
+    """Return the study of a name in a file, which several studies share; its trials depend on the settings.
 
-    A trial takes a dozen writes; they go to memory, and the file has whole trials only.
+    Raises:
+        ClientError: Optuna is not installed.
+        UsageError: the file has a study of this name with other settings.
     """
     optuna = _load_optuna()
     storage.parent.mkdir(parents=True, exist_ok=True)
@@ -286,9 +283,7 @@ def _opened(storage: Path, name: str, settings: Mapping[str, Any]) -> tuple[Any,
     if kept.user_attrs.setdefault("settings", text) != text:
         raise UsageError(f"{storage}: study {name!r} has other settings; choose another --out, or remove the file")
     kept.set_user_attr("settings", text)
-    study = optuna.create_study(direction="maximize")
-    study.add_trials(kept.get_trials(deepcopy=False))
-    return optuna, kept, study
+    return kept
 
 
 @dataclass(frozen=True)
