@@ -84,12 +84,14 @@ class Publisher:
         self._points_seq = 0
         self._relocation: Relocation | None = None  # of the present world
         self._order = threading.Lock()  # sequence numbers go out in order
-        self._own = linked(connect, config=config, timeout=timeout) if connection is None else None
-        link = connection or self._own
-        assert link is not None  # noqa: S101  one of the two is there: said for the type checker
+        self._own: Link | None = None
+        if connection is None:
+            connection = self._own = linked(connect, config=config, timeout=timeout)
         self._detections: Sender | GrpcSender
         self._points: Sender | GrpcSender
-        self._detections, self._points = link.senders(stream, prefix=prefix, cache=cache, cache_clouds=cache_clouds)
+        self._detections, self._points = connection.senders(
+            stream, prefix=prefix, cache=cache, cache_clouds=cache_clouds
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -189,16 +191,16 @@ class Publisher:
                 labels=names,
                 label=index,
                 center=_array(center, 3),
-                size=None if size is None else _array(size, 3),
-                yaw=None if yaw is None else _array(yaw),
-                velocity=None if velocity is None else _array(velocity, 2),
+                size=_array(size, 3),
+                yaw=_array(yaw),
+                velocity=_array(velocity, 2),
                 score=_array(score),
                 has_points=has_points,
                 field_of_view=field_of_view,
-                position_covariance=None if position_covariance is None else _array(position_covariance, 3, 3),
-                embedding=None if embedding is None else _array(embedding, 2),
+                position_covariance=_array(position_covariance, 3, 3),
+                embedding=_array(embedding, 2),
                 embedding_model=embedding_model,
-                attributes=None if attributes is None else _attributes(attributes, len(index)),
+                attributes=_attributes(attributes, len(index)),
             )
             payload = self._detections.pack(message)
             attachment = attachment_of(current_traceparent())
@@ -244,8 +246,10 @@ class Publisher:
         )
 
 
-def _attributes(given: Sequence[Mapping[str, str | tuple[str, float]]], count: int) -> Any:
+def _attributes(given: Sequence[Mapping[str, str | tuple[str, float]]] | None, count: int) -> Any:
     """Return the attributes as `Detections` takes them, which checks their values."""
+    if given is None:
+        return None
     if len(given) != count:
         raise MessageError("invalid_value", "attributes", f"{count} maps, one for each object", str(len(given)))
     found = []
@@ -278,7 +282,7 @@ def _labelled(label: Any, labels: Sequence[str] | None) -> tuple[tuple[str, ...]
 
 def _array(values: Any, *columns: int) -> Any:
     """Return lists as they are (errors then name the element), all else as arrays; a table without rows as a list."""
-    rows = values if isinstance(values, list | tuple) else np.asarray(values)
+    rows = values if values is None or isinstance(values, list | tuple) else np.asarray(values)
     return [] if columns and getattr(rows, "shape", None) == (0,) else rows
 
 

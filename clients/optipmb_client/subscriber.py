@@ -103,10 +103,10 @@ class _Subscription:
         Keys(prefix).matching(pattern, "tracks")  # checks both
         self._counts = collections.Counter[str]()
         self._inbox = Inbox(queue)
-        self._own = opened() if connection is None else None
-        link = connection or self._own
-        assert link is not None  # noqa: S101  one of the two is there: said for the type checker
-        self._subscription = link.subscribe_streams(pattern, self._inbox, *topics, prefix=prefix, history=history)
+        self._own: Link | None = None
+        if connection is None:
+            connection = self._own = opened()
+        self._subscription = connection.subscribe_streams(pattern, self._inbox, *topics, prefix=prefix, history=history)
 
     def __enter__(self) -> Self:
         return self

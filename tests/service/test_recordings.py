@@ -20,7 +20,7 @@ from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint
 from optipmb_service.streams.profiles import Profiles
 from optipmb_service.streams.queries import StreamQueries
-from optipmb_service.zenoh.inputs import Packet
+from optipmb_service.zenoh.topics import Packet
 from registries import Around, packet_of, streams_of
 from router import SECOND
 from scenarios import FILE, PROFILE, SCENARIOS, SENSOR, STREAM, Raw, Recorded, Step

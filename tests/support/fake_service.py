@@ -7,7 +7,7 @@ from typing import Self
 
 import zenoh
 from optipmb_client.incoming import Arrival
-from optipmb_client.zenoh.session import Session
+from optipmb_client.zenoh.session import ZenohSession
 from optipmb_schemas import (
     Detections,
     DrainRequest,
@@ -65,7 +65,7 @@ class FakeService:
         self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._lock = threading.Lock()
         self._opened: list[object] = []
-        self._opened.append(Session(session).subscribe(KEYS.all("detections"), self._on_detections))
+        self._opened.append(ZenohSession(session).subscribe(KEYS.all("detections"), self._on_detections))
         self._work(session.declare_subscriber(KEYS.all("points"), zenoh.handlers.FifoChannel(1000)), self._on_points)
         for what, answer in (("parameters", self._on_parameters), ("reset", self._on_reset)):
             self._work(session.declare_queryable(KEYS.all_queries(what), zenoh.handlers.FifoChannel(100)), answer)

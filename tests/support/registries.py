@@ -12,7 +12,7 @@ from optipmb_service.streams.profiles import Profiles
 from optipmb_service.streams.streams import Streams
 from optipmb_service.telemetry.metrics import Metrics
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
-from optipmb_service.zenoh.inputs import Packet
+from optipmb_service.zenoh.topics import Packet
 from sessions import chained
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import zenoh
 import zenoh.ext
 from optipmb_client.incoming import Arrival
-from optipmb_client.zenoh.session import Session
+from optipmb_client.zenoh.session import ZenohSession
 from optipmb_schemas import (
     Detections,
     Keys,
@@ -250,7 +250,7 @@ class Node:
         def take(arrival: Arrival) -> None:
             collected.add(arrival.key, arrival.payload, arrival.encoding)
 
-        self._closing.append(Session(self.session).subscribe(pattern, take).close)
+        self._closing.append(ZenohSession(self.session).subscribe(pattern, take).close)
         return collected
 
     def _drain(self, subscriber: Any, take: Callable[[Any], None]) -> None:

@@ -17,7 +17,7 @@ from optipmb_client.errors import ConnectionFailed
 from optipmb_client.incoming import Answer, Inbox
 from optipmb_client.zenoh.configuration import BUSY, certificates, configured
 from optipmb_client.zenoh.handles import Dispatcher, Sender
-from optipmb_client.zenoh.session import CACHED, Session, opened
+from optipmb_client.zenoh.session import CACHED, ZenohSession, opened
 
 __all__ = ["DEFAULT_ENDPOINT", "Connection"]
 
@@ -58,7 +58,7 @@ class Connection:
         self.where = ", ".join(endpoints) or str(config)  # for people
         settings = _configuration(endpoints, config, timeout)
         try:
-            self._session = Session(opened(settings))
+            self._session = ZenohSession(opened(settings))
         except ConnectionFailed:
             raise self._unanswered(endpoints, timeout, settings) from None
         # A router that starts at this moment may be known and not linked yet: messages would be lost.

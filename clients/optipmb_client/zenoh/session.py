@@ -32,7 +32,7 @@ from optipmb_client.zenoh.handles import (
 )
 from optipmb_client.zenoh.late_join import ANSWER_S, CacheQueries, LateJoin
 
-__all__ = ["EVERYTHING", "NEWEST", "KeyNumbers", "Opened", "Sample", "Session", "opened"]
+__all__ = ["EVERYTHING", "NEWEST", "KeyNumbers", "Opened", "Sample", "ZenohSession", "opened"]
 
 MOST_KEYS = 0xFFFF
 """Keys that a Zenoh session can declare in its life: it numbers them by 16 bits and gives no number back. Beyond, it
@@ -124,7 +124,7 @@ def close_session(session: Opened) -> None:
         session.close()  # type: ignore[no-untyped-call]  # zenoh's stubs leave it untyped
 
 
-class Session:
+class ZenohSession:
     """A Zenoh session with its declarations; may be used by any threads, but not by callbacks of the network.
 
     It can declare `MOST_KEYS` keys in its life, and closing gives none back. All methods raise `ConnectionFailed` when
@@ -422,7 +422,7 @@ class Session:
                     answers.append(Answer(key, said, str(error.encoding), ok=False))
         return tuple(answers)
 
-    def cached(self, key: str, *, timeout: float) -> list[Answer]:
+    def cached(self, key: str, *, timeout: float = 2.0) -> list[Answer]:
         """Return the messages in publishers' caches under a key expression, in the order of each publisher."""
         return [one for one in self.query(f"{key}/@adv/**", timeout=timeout) if one.ok]
 

@@ -59,7 +59,7 @@ def track_columns(
     *,
     full: bool = False,
     georeference: "Georeference | None" = None,
-    objects: "Objects | None" = None,
+    objects: "ObjectIds | None" = None,
 ) -> Iterator[Columns]:
     """Yield tracks (world frame) by frame index as columns, in blocks of rows; with `full` also the covariance.
 
@@ -86,7 +86,7 @@ def _columns_of(
     *,
     full: bool,
     georeference: "Georeference | None",
-    objects: "Objects | None",
+    objects: "ObjectIds | None",
     joined: bool,
 ) -> Columns:
     """Return the columns of some frames; arguments as for `track_columns`, and whether all frames have `object`."""
@@ -147,7 +147,7 @@ def _rounded(columns: Columns) -> Columns:
 
 
 @dataclass(frozen=True)
-class Objects:
+class ObjectIds:
     """The objects of the confirmed tracks of a recording."""
 
     id: Ints  # (N,) of the tracks, ascending
@@ -248,7 +248,7 @@ class Results:
         self._taken: dict[str, Path | list[int]] = {}  # file, or places of its blocks
 
     def write(
-        self, sequence: "DataSequence", tracks: Mapping[int, Tracks], objects: Objects | None = None
+        self, sequence: "DataSequence", tracks: Mapping[int, Tracks], objects: ObjectIds | None = None
     ) -> Path | Iterable[Columns]:
         """Write the tracks of a sequence by frame index; return the file, or blocks of rows of the table of all.
 

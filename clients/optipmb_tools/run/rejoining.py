@@ -24,7 +24,7 @@ from optipmb.joining.places import KERNEL_M, Passage, Polygon, with_declared
 from optipmb.model.lost_objects import SETTLES_NS, Tracklets
 from optipmb_tools.geometry import Floats, Ints
 from optipmb_tools.results import stacked
-from optipmb_tools.results.output import Objects
+from optipmb_tools.results.output import ObjectIds
 
 AROUND_S: Final = 60.0
 """Beginnings up to this long before and after count for the rate of new objects."""
@@ -52,7 +52,7 @@ class RejoinOptions:
             option = "--rejoin" if error.path.endswith("gap_s") else "--min-probability"
             raise UsageError(f"{option}: expected {error.expected}, received {error.received}") from error
 
-    def objects(self, tracks: Mapping[int, Tracks], parameters: Parameters) -> Objects:
+    def objects(self, tracks: Mapping[int, Tracks], parameters: Parameters) -> ObjectIds:
         """Return the object of each track of a recording, given the tracks by frame in a fixed world frame."""
         found = tracklets(tracks, parameters.labels)
         kinds = Kinds.of(parameters, Rejoin(self.gap_s, exits=self.exits, passages=self.passages))
@@ -65,7 +65,7 @@ class RejoinOptions:
         for k in np.argsort(found.first_ns[after], kind="stable").tolist():  # earlier tracks first
             identity[after[k]] = identity[before[k]]
             product[after[k]] = product[before[k]] * probability[k]
-        return Objects(found.id, identity, product, until)
+        return ObjectIds(found.id, identity, product, until)
 
 
 def places_in(path: Path) -> tuple[tuple[Polygon, ...], tuple[Passage, ...]]:

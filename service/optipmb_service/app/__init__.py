@@ -5,3 +5,6 @@ from typing import Final
 
 ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2)
 """Signals that end a process in order."""
+
+WRONG_USE: Final = 2
+"""Exit status of a command with wrong options or settings."""

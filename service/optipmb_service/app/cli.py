@@ -24,7 +24,7 @@ from optipmb_schemas.installation import install_command
 from typer.main import get_command
 
 from optipmb_service import __version__
-from optipmb_service.app import ENDING, health_command
+from optipmb_service.app import ENDING, WRONG_USE, health_command
 from optipmb_service.app.lifecycle import leave_or_restart
 from optipmb_service.app.processes import run_bridge, run_gateway, run_link, run_log, run_ros2, run_router
 from optipmb_service.cluster.store import StoreError
@@ -46,7 +46,6 @@ from optipmb_service.telemetry import logs
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-WRONG_USE: Final = 2
 PASSED_ON: Final = {"allow_extra_args": True, "ignore_unknown_options": True}
 
 NATS: Final = "nats-server"

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import FrameType
 
-    from optipmb_client.zenoh.session import Session
+    from optipmb_client.zenoh.session import ZenohSession
 
     from optipmb_service.settings import Settings
 
@@ -61,6 +61,7 @@ LATE_S: Final = 2.0  # what wakes up so late was frozen, or starved, with all of
 END_HUNG: Final = 1  # exit status of a process in which a step of the end hung
 RESTART: Final = 75  # exit status of a process that has ended in order to begin again (sysexits.h: try again)
 SWITCH_S: Final = 0.0005  # by default it is ten times as long, and a frame that meets two other threads waits 10 ms
+HOUSEKEEPING_S: Final = 0.5
 KEYS_S: Final = 1.0  # period of the check of declared keys
 GAINED: Final = 0.1  # share of the declared keys that a restart gives back at least
 STDERR: Final = 2
@@ -278,7 +279,7 @@ async def unless(asked: StopRequest, work: Callable[[], _T]) -> _T | None:
     return result.result() if result.done() else None
 
 
-async def watch_keys(asked: StopRequest, session: Callable[[], Session | None], most: int) -> None:
+async def watch_keys(asked: StopRequest, session: Callable[[], ZenohSession | None], most: int) -> None:
     """Have the process begin again before its network session has no number for keys any more.
 
     It does not where that would free few: keys that are open at the end are declared again.

@@ -22,8 +22,8 @@ import optipmb
 from optipmb import Georeference
 from optipmb_service.app.storage import open_store
 from optipmb_service.cluster.store import Fenced, StoreError, Write, load_newest
-from optipmb_service.links.inputs import MOST_STREAMS
 from optipmb_service.links.linker import Linker
+from optipmb_service.links.looks import MOST_STREAMS
 from optipmb_service.links.places import WorldFrame
 from optipmb_service.session.problems import problem_of
 from optipmb_service.telemetry.health import Component

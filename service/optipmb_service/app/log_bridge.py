@@ -18,6 +18,7 @@ from optipmb_service.session.problems import problem_of
 from optipmb_service.streams.kept_tracks import order_of
 from optipmb_service.telemetry.health import Component
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
+from optipmb_service.units import MEGABYTE
 
 if TYPE_CHECKING:
     from optipmb_client.incoming import Arrival
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 CLOSE_S: Final = 1.0
 DRAIN_POLL_S: Final = 0.01
-MEGABYTE: Final = 2**20
 
 
 class LogBridge(Component):

@@ -9,11 +9,11 @@ import asyncio
 import contextlib
 import time
 from importlib import import_module
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import structlog
 
-from optipmb_service.app.lifecycle import grpc_edge, report_ready, run, run_client, sessions_of, unless
+from optipmb_service.app.lifecycle import HOUSEKEEPING_S, grpc_edge, report_ready, run, run_client, sessions_of, unless
 from optipmb_service.telemetry.health import BEAT_S, Component
 from optipmb_service.telemetry.metrics import LINK_METRICS, LOG_METRICS, PROBLEM_METRICS
 from optipmb_service.zenoh.client import Client
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from optipmb_service.telemetry.health import ProcessHealth
 
 log = structlog.get_logger("optipmb_service")
-
-HOUSEKEEPING_S: Final = 0.5
 
 
 async def run_router(settings: Settings) -> int:

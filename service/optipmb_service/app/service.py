@@ -22,12 +22,11 @@ from optipmb_service import __version__
 from optipmb_service.app.lifecycle import CLOSE_S, HANDOVER_S, LAST_S, Deadline, Steps
 from optipmb_service.app.storage import open_log, open_store
 from optipmb_service.cluster.member import Member
-from optipmb_service.session.policy import SECOND
 from optipmb_service.session.problems import problem_of
 from optipmb_service.streams.intake import Intake
 from optipmb_service.streams.kept_tracks import TrackQuery
 from optipmb_service.streams.parts import Parts
-from optipmb_service.streams.persistence import DAY_S, CheckpointWriter
+from optipmb_service.streams.persistence import CheckpointWriter
 from optipmb_service.streams.queries import ServiceQueries, StreamQueries, members_of
 from optipmb_service.streams.scheduler import Scheduler
 from optipmb_service.streams.streams import Streams
@@ -40,6 +39,7 @@ from optipmb_service.telemetry.metrics import (
     StreamFigures,
 )
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
+from optipmb_service.units import DAY_S, SECOND
 from optipmb_service.zenoh.transport import Transport
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ log = structlog.get_logger("optipmb_service")
 DRAIN_POLL_S: Final = 0.01
 JOIN_S: Final = 0.3
 SAVE_S: Final = 0.5  # the last checkpoints have so long even where messages took all the time
-NAME_CHECK_NS: Final = 10_000_000_000  # how often another process of the same name is looked for
+NAME_CHECK_NS: Final = 10 * SECOND  # how often another process of the same name is looked for
 TRACES_S: Final = 1.0  # for sending the last spans
 LEASES_S: Final = 1.0  # kept for releasing the leases, however long the checkpoints take
 

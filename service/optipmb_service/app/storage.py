@@ -12,9 +12,9 @@ from optipmb_schemas import Keys
 from optipmb_service.cluster.leases import NOBODY, PARTITIONS, partition_key, partition_of
 from optipmb_service.cluster.sqlite import SqliteStore, in_use
 from optipmb_service.cluster.store import Fenced, StoreError, Write
-from optipmb_service.streams.persistence import DAY_S
 from optipmb_service.streams.profiles import Fusion
 from optipmb_service.streams.recovery import Log
+from optipmb_service.units import DAY_S
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -25,8 +25,8 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 import optipmb
-from optipmb_service.app import lifecycle
-from optipmb_service.app.lifecycle import grpc_edge, leave, say_ready, settle, unless
+from optipmb_service.app import WRONG_USE, lifecycle
+from optipmb_service.app.lifecycle import HOUSEKEEPING_S, grpc_edge, leave, say_ready, settle, unless
 from optipmb_service.app.service import Service
 from optipmb_service.settings import Settings
 from optipmb_service.streams.profiles import Profiles
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("optipmb_service")
 
-HOUSEKEEPING_S: Final = 0.5
-WRONG_USE: Final = 2
 UNUSED: Final = "scipy.linalg"
 COMPILER: Final = "libllvmlite"
 MAPS: Final = Path("/proc/self/maps")

@@ -27,6 +27,7 @@ from optipmb_service.cluster.leases import (
     wish_key,
 )
 from optipmb_service.cluster.store import ENDED, StoreError, Write
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container
@@ -35,7 +36,6 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("optipmb_service")
 
-SECOND: Final = 1_000_000_000
 LOOKS_PER_LEASE: Final = 8  # each with a renewal: a request to a store elsewhere takes a millisecond of processor
 LONGEST_LOOK_S: Final = 0.1  # of a store on the same machine: how late a killed member may be noticed
 SHORT_LOOK_S: Final = 0.02  # while partitions change hands: each is without a holder for as long

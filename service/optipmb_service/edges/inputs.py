@@ -25,8 +25,9 @@ from optipmb_client.incoming import Answer
 from optipmb_client.trace_context import attachment_of
 from optipmb_schemas.errors import show
 
-from optipmb_service.edges.json_frames import separate
+from optipmb_service.edges.json_frames import STEP_NS, separate
 from optipmb_service.telemetry.problem_reporter import ProblemReporter
+from optipmb_service.units import SECOND
 from optipmb_service.zenoh.client import IdlePool, TooManyStreamsError
 
 if TYPE_CHECKING:
@@ -60,14 +61,9 @@ ALL_FRAMES: Final = 2**20
 """The same of all streams."""
 
 IDLE_PUBLISHERS: Final = 1000
-HISTORY_S: Final = 2.0
-"""Longest wait for the caches of the services."""
 
 FLUSH_S: Final = 1.0
 """Period of summaries of problems."""
-
-STEP_NS: Final = 1000
-"""Least distance of two stamps of arrival."""
 
 OFFSETS: Final = 100
 """Frames by which the offset of a sender's clock is known."""
@@ -78,7 +74,6 @@ NEW_CLOCK: Final = 3
 PACE: Final = 0.25
 """Largest difference of their intervals of arrival from those of their stamps, as a share."""
 
-SECOND: Final = 1_000_000_000
 OTHER_CONTENT: Final = 'a key or stamp of its own: finer stamps, `epoch` and `seq`, or `clock = "arrival"` in `inputs`'
 LATER: Final = frozenset({"busy", "too_many_streams", "unlinked"})
 """Why a frame may be sent again."""
@@ -500,7 +495,7 @@ class Inputs:
 
     def _cached(self, name: str) -> list[tuple[_Head, Answer]]:
         """Return the tracks of a stream that the services keep; may wait."""
-        answers = self.client.cached(self.client.keys.tracks(self._session_of(name)), timeout=HISTORY_S)
+        answers = self.client.cached(self.client.keys.tracks(self._session_of(name)))
         return [(head, one) for one in answers if (head := _head_of(one.payload, name)) is not None]
 
     def _take_tracks(self, name: str, sample: Sample) -> None:

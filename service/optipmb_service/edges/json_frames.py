@@ -24,6 +24,7 @@ from optipmb_schemas.errors import invalid, show
 from optipmb_schemas.json_form import EdgeDetections, EdgeObject
 
 from optipmb_service.edges.mapping import PayloadMapping, mapping_of, other_value
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -38,7 +39,6 @@ MOST_FRAMES: Final = 256
 MOST_SEPARATE: Final = 256
 """Objects of a frame that says nothing of others: each costs a step of the tracker."""
 
-SECOND: Final = 1_000_000_000
 DIGITS: Final = 20
 UNKNOWN: Final = (nan, nan, nan)
 PLACES: Final = ("position", "lat and lon", "box", "foot")
@@ -53,7 +53,7 @@ SEPARATE: Final = ("epoch", "field_of_view")
 
 COLUMNS: Final = ("label", "center", "size", "yaw", "score", "velocity", "position_covariance", "embedding")
 STEP_NS: Final = 1000
-"""Distance of the frames of separate objects."""
+"""Least distance of two stamps that are not the sender's own."""
 
 BESIDE: Final = (2.0, 0.02, 3.0)
 """How far a separate object is looked at: to each side in m, and at least in rad; in range in m."""

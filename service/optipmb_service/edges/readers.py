@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from optipmb_client.incoming import Answer, Arrival
     from optipmb_client.zenoh.handles import Dispatcher
-    from optipmb_client.zenoh.session import Session
+    from optipmb_client.zenoh.session import ZenohSession
     from optipmb_schemas.json_form import Place
 
     from optipmb_service.settings import Settings
@@ -62,9 +62,6 @@ DIGITS: Final = 20
 PROBLEMS: Final = 16
 TRACKS: Final = ("/tracks", "/now")
 """Ends of keys of tracks."""
-
-QUERY_S: Final = 2.0
-"""Longest wait for the services."""
 
 TOLERANCE: Final = 0.999
 """Shortest accepted part of a period: stamps of real sensors jitter."""
@@ -575,7 +572,7 @@ class Feeds:
     """
 
     def __init__(
-        self, session: Session, keys: schemas.Keys, places: Mapping[str, Place], bounds: Bounds = BOUNDS
+        self, session: ZenohSession, keys: schemas.Keys, places: Mapping[str, Place], bounds: Bounds = BOUNDS
     ) -> None:
         self.session = session
         self._keys = keys
@@ -646,7 +643,7 @@ class Feeds:
         """
         if key.endswith(TRACKS):
             self._read_links()
-        answers = self.session.query(f"{key}/@adv/**?_max={most}", timeout=QUERY_S)
+        answers = self.session.query(f"{key}/@adv/**?_max={most}")
         about = self._places, self._ids
         return [Publication(one.key, one.payload, one.encoding, *about, live=False) for one in answers if one.ok]
 
@@ -656,7 +653,7 @@ class Feeds:
             if self._links is not None:
                 return
             self._links = self.session.read_newest(self._keys.all_links(), self._take_links, most=WAITING)
-            for answer in self.session.query(self._keys.all_links_query(), timeout=QUERY_S):
+            for answer in self.session.query(self._keys.all_links_query()):
                 if answer.ok and (links := _valid(schemas.Links, answer)) is not None:
                     self._ids.take(links)
 
@@ -666,7 +663,7 @@ class Feeds:
             self._ids.take(links)
 
 
-async def listed(session: Session, keys: schemas.Keys, pattern: str) -> list[tuple[str, schemas.SessionSummary]]:
+async def listed(session: ZenohSession, keys: schemas.Keys, pattern: str) -> list[tuple[str, schemas.SessionSummary]]:
     """Return the sessions of a pattern by stream, each with its service.
 
     Answers of workers are left out: their parent answers for them.
@@ -675,8 +672,8 @@ async def listed(session: Session, keys: schemas.Keys, pattern: str) -> list[tup
         TransportError: the network cannot be used.
     """
     answers, alive = await asyncio.gather(
-        asyncio.to_thread(session.query, keys.all_status(), timeout=QUERY_S),
-        asyncio.to_thread(session.alive, keys.all_alive(), timeout=QUERY_S),
+        asyncio.to_thread(session.query, keys.all_status()),
+        asyncio.to_thread(session.alive, keys.all_alive()),
     )
     services = {keys.instance_of(key) for key in alive}
     found = []

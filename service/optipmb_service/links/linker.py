@@ -13,9 +13,9 @@ import msgspec
 import numpy as np
 from optipmb_schemas import LinkedObject
 
-from optipmb_service.links import gaps, parts, views
+from optipmb_service.links import components, gaps, views
 from optipmb_service.links.gaps import EXAMPLE, PLACE, Learned
-from optipmb_service.links.inputs import FRESH_NS, WAIT_NS, LinkInputs
+from optipmb_service.links.looks import FRESH_NS, WAIT_NS, LinkInputs
 from optipmb_service.links.objects import APPEARANCE, OBJECT, Objects
 from optipmb_service.links.places import WorldFrame
 from optipmb_service.links.vectors import ObjectVectors
@@ -200,7 +200,7 @@ class Linker:
         own["ended"][revived] = 0
         self._drop_pairs(stamp_ns)
         changed = before != len(own) or len(self._part) != len(own)
-        opposed = changed or len(parts.opposed(self.objects, self.pairs, self._part)) > 0
+        opposed = changed or len(components.opposed(self.objects, self.pairs, self._part)) > 0
         if opposed or not self._same_links(*linked) or ended.any() or revived.any():
             self._settle()
         if self._continue(stamp_ns, np.flatnonzero(ended)):
@@ -266,7 +266,7 @@ class Linker:
         old = (pairs["evidence"] < views.LEAST) | (pairs["stamp_ns"] < stamp_ns - 2 * FRESH_NS)
         # Evidence against two tracks of one part keeps them apart: it is forgotten only once they are gone.
         a, b = (own.at(pairs[side]) for side in ("a", "b"))
-        part = parts.connected(len(own.table), a[pairs["linked"] > 0], b[pairs["linked"] > 0])
+        part = components.connected(len(own.table), a[pairs["linked"] > 0], b[pairs["linked"] > 0])
         old &= (part[a] != part[b]) | (pairs["stamp_ns"] < stamp_ns - 2 * FRESH_NS)
         pairs = pairs[(pairs["linked"] > 0) | (~old & (pairs["how"] == 0))]
         apart = np.flatnonzero(pairs["how"] > 0)
@@ -325,7 +325,7 @@ class Linker:
         self._part, self.grid_ns, self.inputs.is_set_back = np.zeros(0, np.int64), -1, False
 
     def _settle(self) -> None:
-        self._part, new = parts.settle(self.objects, self.pairs)
+        self._part, new = components.settle(self.objects, self.pairs)
         self._changes += [self._row(n) for n in new.tolist()]
 
     def _forget(self, stamp_ns: int) -> None:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb.model.rows import Index
-    from optipmb_service.links.inputs import InputStream, Look
+    from optipmb_service.links.looks import InputStream, Look
 
     Table = NDArray[np.void]
 

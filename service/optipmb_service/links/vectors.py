@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from optipmb.model.rows import Array, Index
-    from optipmb_service.links.inputs import Look
+    from optipmb_service.links.looks import Look
     from optipmb_service.links.objects import Objects
 
     Table = NDArray[np.void]

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from optipmb_service.session.policy import MAX_SENSORS, SECOND
+from optipmb_service.session.policy import MAX_SENSORS
 from optipmb_service.session.timeline import WINDOW, FusedTimeline, number_of
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

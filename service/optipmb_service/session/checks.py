@@ -11,7 +11,8 @@ import optipmb
 from optipmb.learning.doubts import EXPECTED as SIZES
 from optipmb.learning.doubts import SizeCheck
 from optipmb.learning.velocity_check import EXPECTED, VelocityCheck
-from optipmb_service.session.policy import MAX_SENSORS, SECOND
+from optipmb_service.session.policy import MAX_SENSORS
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     import optipmb_schemas as schemas

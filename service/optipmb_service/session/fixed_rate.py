@@ -12,7 +12,7 @@ from optipmb.filter.paths import tracks_ahead
 from optipmb.learning.hindsight import with_hindsight
 from optipmb.model.table import ClassTable
 from optipmb_service.session.outputs import Begun, TrackedFrame
-from optipmb_service.session.policy import SECOND
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

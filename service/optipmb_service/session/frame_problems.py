@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from optipmb_service.session.policy import MAX_SENSORS, SECOND
+from optipmb_service.session.policy import MAX_SENSORS
 from optipmb_service.session.problems import problem_of, sentence
 from optipmb_service.session.timeline import JUMP_FRAMES, Verdict
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     import numpy as np

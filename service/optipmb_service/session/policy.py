@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from optipmb.model.parameters import ALIKE
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     import optipmb
     from optipmb.world.zones import Zone
-
-SECOND: Final = 1_000_000_000
 
 
 class JumpLimits(NamedTuple):

@@ -6,6 +6,8 @@ from typing import Any, Final
 
 import optipmb_schemas as schemas
 
+from optipmb_service.units import DAY_S
+
 CODES: Final = {
     "malformed": ("The bytes are not a message.", "Check the publisher's encoder; compare with the JSON Schemas."),
     "wrong_type": ("The message type does not belong on this key.", "Check the key and the encoding of the publisher."),
@@ -149,7 +151,6 @@ SENTENCES: Final = {
 }
 """Message of a frame's problem by its code, of `restarted` by the reason; `apart`: from the newest frame in time."""
 
-DAY_S: Final = 86_400
 MAX_TEXT: Final = 500
 """Characters of a text in a problem."""
 

@@ -33,11 +33,12 @@ from optipmb_service.session.frame_problems import FrameProblems
 from optipmb_service.session.identity import Incarnation
 from optipmb_service.session.outputs import Begun, CommandRefusedError, Output, Quarantined, events_of
 from optipmb_service.session.pending import PendingFrame, SensorQueues
-from optipmb_service.session.policy import MAX_CLOUD_WAIT_NS, SECOND, Policy
+from optipmb_service.session.policy import MAX_CLOUD_WAIT_NS, Policy
 from optipmb_service.session.state import FilterState, ProcessedFrame
 from optipmb_service.session.timeline import FrameId, FusedTimeline, StreamTimeline, Verdict
 from optipmb_service.session.transition import Transition
 from optipmb_service.session.window import ReorderWindow
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -33,10 +33,11 @@ from optipmb.world.zones import Shapes, ZoneState, adapted, end, observe
 from optipmb_service.session import convert
 from optipmb_service.session.counts import FrameCounts, total
 from optipmb_service.session.outputs import Begun
-from optipmb_service.session.policy import MAX_SENSORS, SECOND
+from optipmb_service.session.policy import MAX_SENSORS
 from optipmb_service.session.state import MAX_LABELS, FilterState, PoseHistory, SensorState
 from optipmb_service.session.timeline import JUMP_FRAMES, FrameId, Verdict
 from optipmb_service.session.worlds import in_one_world, relocated
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

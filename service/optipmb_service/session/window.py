@@ -68,11 +68,11 @@ class ReorderWindow:
 
     def state(self, number: int) -> FilterState:
         """Return the state after so many frames of the window; it is computed when it is not there."""
-        known = number
-        while known and self._after[known - 1] is None:
-            known -= 1
-        state = self._after[known - 1] if known else self.base
-        assert state is not None  # noqa: S101 - the search ended at one that is there; said for the type checker
+        state, known = self.base, 0
+        for at in range(number, 0, -1):
+            if (after := self._after[at - 1]) is not None:
+                state, known = after, at
+                break
         for at in range(known, number):
             state, _ = self.transition.step(state, self._frames[at])
             self._after[at] = state

@@ -13,8 +13,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 from optipmb_service.session.identity import Incarnation
-from optipmb_service.session.policy import SECOND
-from optipmb_service.streams.backlog import MEGABYTE
+from optipmb_service.units import MEGABYTE, SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

@@ -26,8 +26,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import structlog
 
-from optipmb_service.session.policy import SECOND
-from optipmb_service.zenoh.inputs import Packet
+from optipmb_service.units import SECOND
+from optipmb_service.zenoh.topics import Packet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 log = structlog.get_logger("optipmb_service")
 
-MEGABYTE: Final = 2**20
 UNLIMITED: Final = 2**62
 
 UNASKED_NS: Final = 120 * SECOND

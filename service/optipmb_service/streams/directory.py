@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from optipmb_service.session.arrivals import BACK_NS
-from optipmb_service.session.policy import SECOND
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable

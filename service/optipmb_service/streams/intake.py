@@ -26,15 +26,15 @@ import optipmb_schemas as schemas
 import structlog
 
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
-from optipmb_service.session.policy import SECOND
-from optipmb_service.zenoh.inputs import Input
+from optipmb_service.units import SECOND
+from optipmb_service.zenoh.topics import Input
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from optipmb_service.cluster.member import Member
     from optipmb_service.streams.streams import Streams
-    from optipmb_service.zenoh.inputs import Kind, Packet
+    from optipmb_service.zenoh.topics import Kind, Packet
     from optipmb_service.zenoh.transport import Transport
 
 log = structlog.get_logger("optipmb_service")

@@ -14,7 +14,7 @@ from optipmb_service.session.checkpoint import CheckpointError
 from optipmb_service.session.counts import total
 from optipmb_service.session.identity import Incarnation
 from optipmb_service.streams.outbox import Ticket
-from optipmb_service.zenoh.inputs import Packet
+from optipmb_service.zenoh.topics import Packet
 
 if TYPE_CHECKING:
     from collections.abc import Callable

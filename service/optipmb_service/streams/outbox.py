@@ -11,9 +11,9 @@ from optipmb_client.trace_context import attachment_of
 
 from optipmb_service.session.counts import MAX_COUNT
 from optipmb_service.session.outputs import Begun, Quarantined, TrackedFrame
-from optipmb_service.session.policy import SECOND
 from optipmb_service.settings import FARTHEST
 from optipmb_service.streams.persistence import save_dump
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

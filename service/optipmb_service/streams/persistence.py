@@ -33,6 +33,7 @@ from optipmb_service.session.checkpoint import (
     numbers_in,
     seal,
 )
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -51,12 +52,11 @@ MAX_DUMPS: Final = 32
 
 _T = TypeVar("_T")
 
-FAILED_NS: Final = 60 * 1_000_000_000
+FAILED_NS: Final = 60 * SECOND
 """Time after the last failure for which a stream's checkpoint counts as failing."""
 
-DAY_S: Final = 86_400.0
-EXPIRE_EVERY_NS: Final = 3600 * 1_000_000_000
-FIRST_EXPIRY_NS: Final = 600 * 1_000_000_000
+EXPIRE_EVERY_NS: Final = 3600 * SECOND
+FIRST_EXPIRY_NS: Final = 600 * SECOND
 """Time after the start in which streams come back whose checkpoints seem old: the process was off, or a clock wrong."""
 
 MAX_FAILED: Final = 1024

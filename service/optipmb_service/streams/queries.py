@@ -23,8 +23,8 @@ from optipmb_service.cluster.store import StoreError
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.convert import density_of
 from optipmb_service.session.outputs import CommandRefusedError
-from optipmb_service.session.policy import SECOND
 from optipmb_service.session.problems import problem_of
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from optipmb_service.streams.kept_tracks import TrackQuery
     from optipmb_service.streams.stream import Stream
     from optipmb_service.streams.streams import Streams
-    from optipmb_service.zenoh.inputs import Packet
+    from optipmb_service.zenoh.topics import Packet
 
 log = structlog.get_logger("optipmb_service")
 

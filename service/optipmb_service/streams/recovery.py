@@ -9,7 +9,7 @@ import structlog
 
 from optipmb_service.cluster.store import LogQuery, Position
 from optipmb_service.session.timeline import number_of
-from optipmb_service.zenoh.inputs import Packet
+from optipmb_service.zenoh.topics import Packet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence

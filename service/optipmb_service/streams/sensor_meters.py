@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from optipmb_service.session.policy import MAX_SENSORS, SECOND
+from optipmb_service.session.policy import MAX_SENSORS
 from optipmb_service.telemetry.stream_meter import StreamMeter
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     import optipmb_schemas as schemas
 
     from optipmb_service.streams.parts import Parts
-    from optipmb_service.zenoh.inputs import Packet
+    from optipmb_service.zenoh.topics import Packet
 
 log = structlog.get_logger("optipmb_service")
 

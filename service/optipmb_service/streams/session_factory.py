@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any, Final
 
 from optipmb.world.zones import MOST, Zone
 from optipmb_service.session.fixed_rate import FixedRate
-from optipmb_service.session.policy import SECOND, Policy
+from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.streams.backlog import MEGABYTE
+from optipmb_service.units import MEGABYTE, SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable

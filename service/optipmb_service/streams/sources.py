@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from optipmb_client.errors import ConnectionFailed as TransportError
 
-from optipmb_service.session.policy import SECOND
+from optipmb_service.units import SECOND
 
 if TYPE_CHECKING:
     from optipmb_service.session.arrivals import Arrivals
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from optipmb_service.streams.directory import StreamDirectory
     from optipmb_service.streams.parts import Parts
     from optipmb_service.streams.stream import Stream
-    from optipmb_service.zenoh.inputs import Packet
+    from optipmb_service.zenoh.topics import Packet
 
 LOG_READS: Final = 32
 """Sessions that read the log at once: thousands that are silent are no load on its servers."""

@@ -23,7 +23,7 @@ from optipmb_service.streams.outbox import StreamOutbox, Ticket
 from optipmb_service.streams.sensor_meters import SensorMeters
 from optipmb_service.streams.sources import Sources
 from optipmb_service.telemetry.stream_meter import StreamMeter
-from optipmb_service.zenoh.inputs import Packet
+from optipmb_service.zenoh.topics import Packet
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

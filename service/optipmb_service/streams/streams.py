@@ -17,15 +17,15 @@ import optipmb_schemas as schemas
 
 from optipmb_service.cluster.leases import Change, partition_of
 from optipmb_service.session.counts import MessageCounters
-from optipmb_service.session.policy import SECOND
 from optipmb_service.streams.admission import Admission
-from optipmb_service.streams.backlog import MEGABYTE, Backlog, BacklogBounds, ByteBudget
+from optipmb_service.streams.backlog import Backlog, BacklogBounds, ByteBudget
 from optipmb_service.streams.directory import StreamDirectory
 from optipmb_service.streams.profiles import FUSED
 from optipmb_service.streams.rivals import Rivals
 from optipmb_service.streams.session_factory import PARTS
 from optipmb_service.streams.sources import read_logs
 from optipmb_service.streams.stream import Stream
+from optipmb_service.units import MEGABYTE, SECOND
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterable, Iterator
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from optipmb_service.session.checkpoint import Checkpoint
     from optipmb_service.session.identity import Incarnation
     from optipmb_service.streams.parts import Parts
-    from optipmb_service.zenoh.inputs import Packet
+    from optipmb_service.zenoh.topics import Packet
 
 MAX_UNPROVEN: Final = 256
 """Streams at once that have not sent a valid message yet."""

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from opentelemetry.sdk.trace import ReadableSpan
 
     from optipmb_service.session.outputs import TrackedFrame
-    from optipmb_service.zenoh.inputs import Packet
+    from optipmb_service.zenoh.topics import Packet
 
 log = structlog.get_logger("optipmb_service")
 

@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Final
 import structlog
 from optipmb_schemas.certificates import end_of, ended
 
+from optipmb_service.units import DAY_S
+
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
 LOOK_S: Final = 5.0  # files are read again after so long
 WARN_DAYS: Final = 7.0
-DAY_S: Final = 86_400.0
 
 log = structlog.get_logger("optipmb_service")
 

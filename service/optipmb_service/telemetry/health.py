@@ -14,7 +14,7 @@ from optipmb_service.telemetry.metrics import PROCESS_METRICS
 
 if TYPE_CHECKING:
     import optipmb_schemas as schemas
-    from optipmb_client.zenoh.session import Session
+    from optipmb_client.zenoh.session import ZenohSession
 
     from optipmb_service.telemetry.certificates import Certificates
     from optipmb_service.telemetry.metrics import Metrics
@@ -32,9 +32,9 @@ class Component:
         session: on the network, if it has one.
     """
 
-    _session: Session | None = None
+    _session: ZenohSession | None = None
 
-    def __init__(self, session: Session | None = None) -> None:
+    def __init__(self, session: ZenohSession | None = None) -> None:
         self._session = session
 
     @property
@@ -66,7 +66,7 @@ class Component:
         """Return its report; None when it makes none."""
         return None
 
-    def session(self) -> Session | None:
+    def session(self) -> ZenohSession | None:
         """Return the session by which readers of this process subscribe; None: there is none now."""
         return self._session
 
@@ -128,7 +128,7 @@ class ProcessHealth:
         """Return the service's own report; None while it starts."""
         return self._service.status()
 
-    def session(self) -> Session | None:
+    def session(self) -> ZenohSession | None:
         """Return the session for readers (`Component.session`); None while the service starts."""
         return self._service.session()
 

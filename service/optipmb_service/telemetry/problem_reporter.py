@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
+from optipmb_service.units import SECOND
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -24,7 +26,6 @@ log = structlog.get_logger("optipmb_service")
 
 MAX_KINDS: Final = 4096  # kinds of problems remembered for their rate
 NEWEST: Final = 20  # problems kept for the status
-SECOND: Final = 1_000_000_000
 PUBLISH_EVERY_NS: Final = SECOND
 LOG_EVERY_NS: Final = 10 * SECOND
 PUBLISHED_PER_SECOND: Final = 200

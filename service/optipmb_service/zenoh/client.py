@@ -18,7 +18,7 @@ import optipmb_schemas as schemas
 import structlog
 from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.zenoh.configuration import BUSY, certificates, configured, loaded
-from optipmb_client.zenoh.session import Session
+from optipmb_client.zenoh.session import ZenohSession
 from optipmb_client.zenoh.session import opened as open_session
 
 if TYPE_CHECKING:
@@ -251,7 +251,7 @@ class Outgoing:
             sender.close()
 
 
-class Client(Session):
+class Client(ZenohSession):
     """A session on the network; a client waits for a router until it has one.
 
     Raises:
@@ -289,7 +289,7 @@ class Client(Session):
                 self.put(self.keys.problems(problem.stream), schemas.encode(problem), schemas.encoding_of(problem))
 
     def subscribe(self, key: str, receive: Callable[[Arrival], object], *, history: bool | None = None) -> Dispatcher:
-        """Hand over publications under a key expression, as `Session` does.
+        """Hand over publications under a key expression, as `ZenohSession` does.
 
         Raises:
             TransportError: also where too many were opened.

@@ -13,17 +13,17 @@ from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_client.trace_context import attached
 
 from optipmb_service.zenoh.client import Client
-from optipmb_service.zenoh.inputs import Packet, ReturnedPublishers, Topic
+from optipmb_service.zenoh.topics import Packet, ReturnedPublishers, Topic
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from collections.abc import Set as AbstractSet
 
     from optipmb_client.zenoh.handles import Declaration, Dispatcher, Query, Sender
-    from optipmb_client.zenoh.session import Sample, Session
+    from optipmb_client.zenoh.session import Sample, ZenohSession
 
     from optipmb_service.settings import Settings
-    from optipmb_service.zenoh.inputs import Kind
+    from optipmb_service.zenoh.topics import Kind
 
 MOST_OPEN: Final = 256
 """Queries of one key expression that may be open; those beyond are refused."""
@@ -70,7 +70,7 @@ class Announcements:
     token for each stream it was most of what a new stream cost, and with 10,000 streams beyond what one router can do.
     """
 
-    def __init__(self, session: Session, keys: schemas.Keys, instance: str, run: str) -> None:
+    def __init__(self, session: ZenohSession, keys: schemas.Keys, instance: str, run: str) -> None:
         self._session, self._keys, self._instance, self._run = session, keys, instance, run
         self._groups: dict[str, tuple[str, ...]] = {}
         """The group of each stream that is announced."""

@@ -18,7 +18,7 @@ from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
 from optipmb_service.streams.profiles import Fusion
 from optipmb_service.streams.recovery import Log
-from optipmb_service.zenoh.inputs import Packet
+from optipmb_service.zenoh.topics import Packet
 from router import until
 
 import optipmb

@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from optipmb_service.session.policy import SECOND
 from optipmb_service.streams.backlog import UNASKED_NS, UNLIMITED, Backlog, BacklogBounds, ByteBudget
-from optipmb_service.zenoh.inputs import PACKET_BYTES, Packet
+from optipmb_service.units import SECOND
+from optipmb_service.zenoh.topics import PACKET_BYTES, Packet
 
 TOPICS = {True: "detections", False: "points"}
 

@@ -1,7 +1,7 @@
 """Which streams a discoverer announces that have no session."""
 
-from optipmb_service.session.policy import SECOND
 from optipmb_service.streams.directory import BACK_NS, MAX_UNPROVEN_ANNOUNCED, QUEUED_NS, UNPROVEN_NS, StreamDirectory
+from optipmb_service.units import SECOND
 
 IDLE_NS = 600 * SECOND
 

@@ -34,7 +34,7 @@ from optipmb_service.streams.persistence import CheckpointWriter
 from optipmb_service.streams.stream import Stream
 from optipmb_service.telemetry.health import ProcessHealth
 from optipmb_service.telemetry.metrics import Metrics
-from optipmb_service.zenoh.inputs import Packet
+from optipmb_service.zenoh.topics import Packet
 from router import Node, Sensor, until
 from sessions import Gated
 

@@ -10,7 +10,7 @@ import optipmb_schemas as schemas
 import pytest
 from optipmb_service.session.session import Session
 from optipmb_service.session.state import size_of
-from optipmb_service.streams.backlog import MEGABYTE
+from optipmb_service.units import MEGABYTE
 from optipmb_service.zenoh.transport import TRACKS_CACHE
 from registries import Around, streams_of
 from router import Node, Sensor

@@ -11,12 +11,12 @@ from typing import Any
 import pytest
 from optipmb_schemas import Keys
 from optipmb_service.cluster.leases import PARTITIONS, Change, partition_of
-from optipmb_service.session.policy import SECOND
 from optipmb_service.streams import directory, streams
 from optipmb_service.streams.backlog import UNASKED_NS
 from optipmb_service.streams.intake import DISCOVERY, NEW_STREAMS, Intake
 from optipmb_service.streams.profiles import Fusion
-from optipmb_service.zenoh.inputs import ALL, Packet
+from optipmb_service.units import SECOND
+from optipmb_service.zenoh.topics import ALL, Packet
 from registries import Around, packet_of, streams_of
 from router import Sensor, until
 

@@ -9,7 +9,7 @@ from typing import Any
 from optipmb_service.session.counts import MessageCounters
 from optipmb_service.session.policy import MAX_SENSORS
 from optipmb_service.streams import backlog, opening, outbox, stream
-from optipmb_service.zenoh.inputs import Packet
+from optipmb_service.zenoh.topics import Packet
 from registries import Around, packet_of, streams_of
 from router import Sensor
 

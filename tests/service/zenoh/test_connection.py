@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import zenoh
 from optipmb_client.zenoh.handles import Sender
-from optipmb_client.zenoh.session import Session
+from optipmb_client.zenoh.session import ZenohSession
 from optipmb_schemas import Keys, Tracks, encoding_of
 from optipmb_service.settings import load
 from optipmb_service.zenoh.client import Client
@@ -84,7 +84,7 @@ def test_tracks_come_whichever_publisher_was_declared_first(endpoint: str) -> No
             got: list[bytes] = []
             publishers[number].put(payload)
             key = KEYS.tracks(f"site/node/lidar{number}")
-            subscription = Session(viewer).subscribe(key, lambda arrival: got.append(arrival.payload))
+            subscription = ZenohSession(viewer).subscribe(key, lambda arrival: got.append(arrival.payload))
             until(lambda: payload in got, "a message of the cache")
             publishers[number].put(payload + b" and on")
             until(lambda: payload + b" and on" in got, "a message")

@@ -6,42 +6,42 @@ from collections.abc import Callable, Iterator
 import pytest
 import zenoh
 from optipmb_client.errors import ConnectionFailed as TransportError
-from optipmb_client.zenoh.session import CACHED, MOST_KEYS, PLAIN, Session
-from optipmb_service.zenoh.inputs import Topic
+from optipmb_client.zenoh.session import CACHED, MOST_KEYS, PLAIN, ZenohSession
+from optipmb_service.zenoh.topics import Topic
 
 
 @pytest.fixture
-def session() -> Iterator[Session]:
+def session() -> Iterator[ZenohSession]:
     config = zenoh.Config()
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("listen/endpoints", "[]")
-    session = Session(zenoh.open(config))
+    session = ZenohSession(zenoh.open(config))
     yield session
     session.close()
     assert session.key_numbers.open == 0
 
 
-def _published(session: Session, key: str) -> Callable[[], object]:
+def _published(session: ZenohSession, key: str) -> Callable[[], object]:
     return session.cached_sender(key, "", cache=1, detected=False).close
 
 
-def _received(session: Session, key: str) -> Callable[[], object]:
+def _received(session: ZenohSession, key: str) -> Callable[[], object]:
     topic = Topic("detections", session, lambda _: None)
     topic.subscribe(key, key)
     return lambda: topic.leave([key])
 
 
-def _received_plainly(session: Session, key: str) -> Callable[[], object]:
+def _received_plainly(session: ZenohSession, key: str) -> Callable[[], object]:
     topic = Topic("points", session, lambda _: None)
     topic.subscribe(key, key, cached=False)
     return lambda: topic.leave([key])
 
 
-def _known(session: Session, key: str) -> Callable[[], object]:
+def _known(session: ZenohSession, key: str) -> Callable[[], object]:
     return session.declare_key(key).close
 
 
-def test_no_number_is_given_twice(session: Session) -> None:
+def test_no_number_is_given_twice(session: ZenohSession) -> None:
     """When a session has used up its numbers, nothing is declared, and open subscriptions still deliver.
 
     Zenoh alone goes on with numbers that are in use, and what these publishers send is lost without an error.
@@ -64,7 +64,7 @@ def test_no_number_is_given_twice(session: Session) -> None:
     assert received == [b"late"]
 
 
-def test_numbers_are_in_use_until_what_has_them_is_withdrawn(session: Session) -> None:
+def test_numbers_are_in_use_until_what_has_them_is_withdrawn(session: ZenohSession) -> None:
     """Withdrawn again, nothing is given back twice; used-up numbers stay so."""
     subscription = session.subscribe("some/**", lambda _: None)
     key = session.declare_key("some/key")

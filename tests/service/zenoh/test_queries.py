@@ -12,7 +12,7 @@ from optipmb_schemas import Keys, Problem, SessionState, decode
 from optipmb_service.settings import Settings
 from optipmb_service.streams import queries
 from optipmb_service.streams.queries import ServiceQueries, StreamQueries
-from optipmb_service.zenoh.inputs import Packet
+from optipmb_service.zenoh.topics import Packet
 from optipmb_service.zenoh.transport import Transport
 from registries import Around, packet_of, streams_of
 from router import Node, Sensor, until

@@ -11,10 +11,10 @@ from typing import Final
 import optipmb_client.zenoh.session
 import pytest
 from optipmb_client.zenoh.handles import ItemQueue
-from optipmb_client.zenoh.session import Session
+from optipmb_client.zenoh.session import ZenohSession
 from optipmb_schemas import Keys
 from optipmb_service.settings import load
-from optipmb_service.zenoh.inputs import Topic
+from optipmb_service.zenoh.topics import Topic
 from optipmb_service.zenoh.transport import Transport
 from router import until
 from routers import free_endpoint, open_client, open_router
@@ -24,9 +24,9 @@ HANGS_S: Final = 60.0
 
 
 @pytest.fixture
-def session() -> Iterator[Session]:
+def session() -> Iterator[ZenohSession]:
     with open_router(free_endpoint()) as session:
-        yield Session(session)
+        yield ZenohSession(session)
 
 
 def ends(work: Callable[[], object]) -> None:
@@ -36,7 +36,7 @@ def ends(work: Callable[[], object]) -> None:
     assert not thread.is_alive()
 
 
-def test_a_question_has_as_many_answers_as_there_are(session: Session) -> None:
+def test_a_question_has_as_many_answers_as_there_are(session: ZenohSession) -> None:
     """The caches of one's own hold more than any channel of Zenoh; messages are sent meanwhile."""
     publishers = [session.cached_sender(KEYS.tracks(f"site/node/{one}"), "", cache=50) for one in range(8)]
     for publisher in publishers:
@@ -79,7 +79,7 @@ def test_a_channel_waits_for_room_only_where_it_is_read() -> None:
     assert not third.is_alive()
 
 
-def test_subscribing_to_what_is_sent_in_the_same_session_waits_for_no_cache(session: Session) -> None:
+def test_subscribing_to_what_is_sent_in_the_same_session_waits_for_no_cache(session: ZenohSession) -> None:
     """A cache answers a new subscription with its lock held; asking it once more from there must not wait for it."""
     received = []
     topic = Topic("detections", session, received.append)

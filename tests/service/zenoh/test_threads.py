@@ -6,7 +6,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import zenoh
-from optipmb_client.zenoh.session import Session
+from optipmb_client.zenoh.session import ZenohSession
 from routers import free_endpoint, open_client, open_router
 from service_process import ServiceProcess
 
@@ -29,7 +29,7 @@ def test_a_thread_of_the_network_keeps_its_state() -> None:
 
     endpoint = free_endpoint()
     with open_router(endpoint), open_client(endpoint) as receiver, open_client(endpoint) as sender:
-        Session(receiver).listen("some/*/messages", take)
+        ZenohSession(receiver).listen("some/*/messages", take)
         publisher = sender.declare_publisher("some/other/messages")
         while not enough.wait(0.01):  # one after the other: messages at once would share a state anyway
             publisher.put(b"message")

@@ -10,7 +10,7 @@ import zenoh.ext
 from fleet import RouterProcess
 from optipmb_client import Connection
 from optipmb_client.zenoh.configuration import configured
-from optipmb_client.zenoh.session import Session, opened
+from optipmb_client.zenoh.session import ZenohSession, opened
 from router import until
 
 ROUNDS = 60
@@ -24,7 +24,7 @@ def session() -> Iterator[zenoh.Session]:
     config.insert_json5("scouting/multicast/enabled", "false")
     config.insert_json5("listen/endpoints", "[]")
     with zenoh.open(config) as session:
-        Session(session).listen("noise/*/@adv/pub/**", lambda _: None)
+        ZenohSession(session).listen("noise/*/@adv/pub/**", lambda _: None)
         noise = [_publisher(session, f"noise/{number}") for number in range(20)]
         yield session
         noise.clear()
@@ -45,7 +45,7 @@ def _publisher(session: zenoh.Session, key: str) -> Any:
 @pytest.mark.timeout(40)  # six stops take longer
 def test_withdrawing_never_stops_the_process(session: zenoh.Session) -> None:
     """A publisher is withdrawn, and with its token, in any state of the network's threads."""
-    link = Session(session)
+    link = ZenohSession(session)
     for number in range(ROUNDS):
         sender = link.cached_sender(f"stream/{number}", "", cache=1)
         sender.put(b"what heartbeats tell of")
@@ -74,7 +74,7 @@ def test_nothing_withdrawn_while_a_link_is_set_up_stays_at_the_router() -> None:
     with RouterProcess() as router:
         values = {"mode": "client", "connect/endpoints": [router.endpoint], "connect/timeout_ms": -1}
         zenohs = opened(configured(values))
-        session = Session(zenohs)
+        session = ZenohSession(zenohs)
         tokens = {f"token/{number}": session.token(f"token/{number}") for number in range(2000)}
 
         def close_some() -> None:

@@ -56,7 +56,7 @@ async def track(call: Call) -> None:
     async with (
         network.subscribed(tracks, answers.listener),
         network.subscribed(keys.problems(inputs.stream), answers.listener),
-        inputs.opened(),
+        inputs.opened() as outgoing,
         call.writing(outbox),
     ):
         cached = [one for one in await network.recent(tracks) if is_own(one)]
@@ -68,7 +68,7 @@ async def track(call: Call) -> None:
             elif isinstance(message, schemas.Detections | schemas.Points):
                 if isinstance(message, schemas.Detections) and (message.epoch, message.seq) not in known:
                     answers.in_flight.add(message.epoch, message.seq)
-                await inputs.send(message)
+                await inputs.send(outgoing, message)
                 await answers.in_flight.below(WINDOW)
             message = await inputs.next()
         await answers.in_flight.below(1)
@@ -108,7 +108,7 @@ async def publish(call: Call) -> None:
                 if isinstance(message, schemas.Problem):
                     answers.report(message)
                 elif isinstance(message, schemas.Detections | schemas.Points):
-                    await inputs.send(message)
+                    await inputs.send(outgoing, message)
                     acknowledgements.add(message)
                 message = await inputs.next()
             acknowledgements.send()
@@ -129,7 +129,6 @@ class _Inputs:
         self._call = call
         self._kind = kind
         self._options = pb.PublishOptions()
-        self._outgoing: Outgoing | None = None
         self._matched = asyncio.Event()
         self._waited = False
         self._traceparent = ""
@@ -166,17 +165,14 @@ class _Inputs:
 
         key = self.stream, self._options.cache or CACHE, self._options.cache_clouds
         async with self._call.gateway.network.publishing(key, matching) as outgoing:
-            self._outgoing = outgoing
             yield outgoing
 
-    async def send(self, message: schemas.Detections | schemas.Points) -> None:
-        """Hand a message to the network; a cloud only if somebody takes it.
+    async def send(self, outgoing: Outgoing, message: schemas.Detections | schemas.Points) -> None:
+        """Hand a message to the publishers; a cloud only if somebody takes it.
 
         Raises:
             TransportError: the network cannot be used.
         """
-        outgoing = self._outgoing
-        assert outgoing is not None  # noqa: S101 - opened before: said for the type checker
         if isinstance(message, schemas.Points):
             if not self._waited and not outgoing.points_wanted:
                 with contextlib.suppress(TimeoutError):

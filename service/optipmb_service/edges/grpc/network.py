@@ -38,9 +38,6 @@ IDLE_SUBSCRIPTIONS: Final = 256
 IDLE_PUBLISHERS: Final = 64
 """How many are kept without a call; a publisher is kept with its cache."""
 
-HISTORY_S: Final = 2.0
-"""Longest wait for the caches of the services."""
-
 MAX_EARLY: Final = 1024
 """Most items that wait until it is known what the caches hold."""
 
@@ -191,7 +188,7 @@ class Network:
         return await asyncio.to_thread(self._cached, key, partial(self._decoded, schemas.Events))
 
     def _cached(self, key: str, read: Callable[[Answer], T | None]) -> list[T]:
-        messages = self._client.cached(key, timeout=HISTORY_S)
+        messages = self._client.cached(key)
         return [found for one in messages if (found := read(one)) is not None]
 
     def _receive(self, listeners: tuple[Listener, ...], message: Arrival) -> None:

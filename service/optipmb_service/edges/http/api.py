@@ -31,7 +31,7 @@ from optipmb_service.edges.readers import Feeds, Reader, Wish, listed
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
 
-    from optipmb_client.zenoh.session import Session
+    from optipmb_client.zenoh.session import ZenohSession
     from optipmb_schemas.json_form import Place
     from starlette.requests import HTTPConnection, Request
     from starlette.types import Receive, Scope, Send
@@ -217,7 +217,7 @@ class Readers:
         self.room = Room(settings.http_clients, "readers")
         self._feeds: Feeds | None = None
 
-    def session(self) -> Session:
+    def session(self) -> ZenohSession:
         """Return the session of the process.
 
         Raises:

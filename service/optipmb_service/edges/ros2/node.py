@@ -33,7 +33,6 @@ CLOUDS: Final = 8
 """Messages of a topic, or clouds, between Zenoh and the reader; the oldest goes beyond it."""
 
 JOIN_S: Final = 1.0
-QUERY_S: Final = 2.0
 CACHE: Final = 400  # detections of a stream kept for a service that restarts: 10 s at 20 Hz
 
 log = structlog.get_logger("optipmb_service")
@@ -164,7 +163,7 @@ class Ros2Node:
         key, encoding = self.client.keys.query(stream, "parameters"), schemas.encoding_of(parameters)
         why = ""
         try:
-            answers = self.client.query(key, schemas.encode(parameters), encoding, timeout=QUERY_S)
+            answers = self.client.query(key, schemas.encode(parameters), encoding)
             if not any(answer.ok for answer in answers):
                 why = schemas.decode(answers[0].payload, schemas.Problem).message if answers else "nobody answered"
         except (ConnectionFailed, schemas.MessageError) as error:

@@ -7,12 +7,12 @@ from functools import partial
 from types import SimpleNamespace
 from typing import Any, Final, cast
 
-import optipmb_service.zenoh.inputs
+import optipmb_service.zenoh.topics
 import pytest
 import zenoh
-from optipmb_client.zenoh.session import Session
+from optipmb_client.zenoh.session import ZenohSession
 from optipmb_schemas import Keys
-from optipmb_service.zenoh.inputs import ALL, Topic
+from optipmb_service.zenoh.topics import ALL, Topic
 from router import Collected
 from routers import free_endpoint, open_router
 
@@ -27,7 +27,7 @@ class Network:
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
-        self.link = Session(session)
+        self.link = ZenohSession(session)
         self.publisher = self.link.cached_sender(KEY, "", cache=100)
         self.received = Collected()
         self.answered: list[str] = []
@@ -119,7 +119,7 @@ def test_an_error_while_a_cache_is_asked_ends_nothing(network: Network, monkeypa
         raise zenoh.ZError("closed")
 
     closed: Any = SimpleNamespace(_session=SimpleNamespace(get=fail))
-    ask = Session.ask
+    ask = ZenohSession.ask
     monkeypatch.setattr(network.link, "ask", lambda *query: ask(closed, *query))
     topic = Topic("detections", network.link, network.receive)
     topic.subscribe(ALL, KEYS.all("detections"))
@@ -163,7 +163,7 @@ def test_messages_of_several_threads_are_handed_over_one_at_a_time(network: Netw
 
 def test_a_thread_waits_while_too_many_messages_wait(network: Network, monkeypatch: pytest.MonkeyPatch) -> None:
     """While more messages wait than may, the thread that brings the next one waits; then all come in their order."""
-    monkeypatch.setattr(optipmb_service.zenoh.inputs, "MOST", 2)
+    monkeypatch.setattr(optipmb_service.zenoh.topics, "MOST", 2)
     arrived, may_go_on, received = threading.Event(), threading.Event(), Collected()
 
     def receive(sample: zenoh.Sample) -> None:
@@ -199,7 +199,7 @@ def test_a_thread_waits_while_too_many_messages_wait(network: Network, monkeypat
 def test_a_topic_is_closed_again_while_a_subscription_does_not_return() -> None:
     """The end closes a topic again whose first close is stuck: each subscription is withdrawn once."""
     withdrawn: list[str] = []
-    topic = Topic("detections", cast("Session", SimpleNamespace(ask=None)), lambda _: None)
+    topic = Topic("detections", cast("ZenohSession", SimpleNamespace(ask=None)), lambda _: None)
 
     def subscriber(name: str) -> Any:
         def close() -> None:

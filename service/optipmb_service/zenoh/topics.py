@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
     from optipmb_client.zenoh.handles import Declaration
-    from optipmb_client.zenoh.session import Sample, Session
+    from optipmb_client.zenoh.session import Sample, ZenohSession
 
 log = structlog.get_logger("optipmb_service")
 
@@ -119,7 +119,7 @@ class Topic:
     def __init__(
         self,
         name: str,
-        session: Session,
+        session: ZenohSession,
         receive: Callable[[Sample], None],
         answered: Callable[[str], None] = lambda _: None,
     ) -> None:
@@ -230,7 +230,7 @@ class ReturnedPublishers:
             known.
     """
 
-    def __init__(self, session: Session, due: Callable[[str, int], int]) -> None:
+    def __init__(self, session: ZenohSession, due: Callable[[str, int], int]) -> None:
         self._session = session
         self._due = due
         self._waiting: dict[str, tuple[int, int]] = {}

@@ -1,8 +1,7 @@
 """Parts of linked objects, and their global ids.
 
 Linked objects form parts, in which no two tracks of one session exist at once, and no two that overlapping views show
-to be two objects. The oldest object of a part gives it its
-id.
+to be two objects. The oldest object of a part gives it its id.
 """
 
 from __future__ import annotations
