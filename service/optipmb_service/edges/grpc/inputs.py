@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
+from optipmb_schemas.protobuf.convert import EncodedTracks
 
-from optipmb_service.edges.grpc.network import Item, Listener
+from optipmb_service.edges.grpc.network import Listener, problem_response, tracks_response
 from optipmb_service.edges.grpc.selection import check_bound
 from optipmb_service.edges.inputs import CACHE, WINDOW, InFlight, put
 from optipmb_service.edges.readers import Outbox
@@ -19,9 +20,8 @@ from optipmb_service.edges.readers import Outbox
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable
 
-    from optipmb_schemas.protobuf.convert import EncodedTracks
-
     from optipmb_service.edges.grpc.calls import Call
+    from optipmb_service.edges.grpc.network import Received
     from optipmb_service.zenoh.client import Outgoing
 
 MAX_CACHE: Final = 4096
@@ -83,7 +83,7 @@ def _already_tracked(cached: Iterable[EncodedTracks], first: Input, outbox: Outb
     for tracks in cached:
         if tracks.epoch == first.epoch and tracks.stamp_ns >= first.stamp_ns:
             known.add((tracks.epoch, tracks.seq))
-            response = Item.of_tracks(tracks).response
+            response = tracks_response(tracks)
             outbox.put(tracks.stream, response, len(response))
     return known
 
@@ -244,14 +244,15 @@ class _Answers:
         """Report a message that was refused here, to the caller and the network, from which it comes back."""
         self._reported.append((problem.code, problem.path))
         self._gateway.refused(problem)
-        response = Item.of_problem(problem).response
+        response = problem_response(problem)
         self._outbox.put(problem.stream, response, len(response))
 
-    def _answer(self, item: Item) -> None:
-        if item.tracks is not None:
-            self.in_flight.remove(item.tracks.epoch, item.tracks.seq)
-        if item.problem not in self._reported:
-            self._outbox.put(item.stream, item.response, len(item.response))
+    def _answer(self, message: Received, response: bytes) -> None:
+        if isinstance(message, EncodedTracks):
+            self.in_flight.remove(message.epoch, message.seq)
+        elif isinstance(message, schemas.Problem) and (message.code, message.path) in self._reported:
+            return
+        self._outbox.put(message.stream, response, len(response))
 
 
 class _Acknowledgements:

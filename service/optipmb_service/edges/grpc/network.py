@@ -9,10 +9,8 @@ from __future__ import annotations
 import asyncio
 import collections
 import contextlib
-import itertools
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 import optipmb_schemas as schemas
 from optipmb_schemas.protobuf import convert
@@ -31,6 +29,7 @@ if TYPE_CHECKING:
     from optipmb_service.edges.grpc.selection import Filter
     from optipmb_service.zenoh.client import Client, Outgoing
 
+    Received: TypeAlias = EncodedTracks | schemas.Problem | schemas.Events
     T = TypeVar("T")
     M = TypeVar("M", bound=schemas.Message)
 
@@ -39,7 +38,7 @@ IDLE_PUBLISHERS: Final = 64
 """How many are kept without a call; a publisher is kept with its cache."""
 
 MAX_EARLY: Final = 1024
-"""Most items that wait until it is known what the caches hold."""
+"""Most messages that wait until it is known what the caches hold."""
 
 _TRACKS: Final = b"\x0a"
 """Tag of field 1, `tracks`, of all responses with tracks."""
@@ -48,47 +47,31 @@ PublisherKey = tuple[str, int, int]
 """Stream, cached detections, cached clouds."""
 
 
-@dataclass(frozen=True, slots=True)
-class Item:
-    """Message of the network, encoded as a response of any streaming method.
+def tracks_response(tracks: EncodedTracks, selection: Filter = EVERYTHING) -> bytes:
+    """Return tracks as a response of any streaming method."""
+    payload = selection.of(tracks.message()).SerializeToString() if selection.key else tracks.payload
+    return b"".join((_TRACKS, varint(len(payload)), payload))
 
-    Attributes:
-        tracks: of a message of tracks, as they came; else None.
-        problem: code and path of a problem; else None.
-        events: events of zones, of which each call makes a response of its own; else None.
-    """
 
-    stream: str
-    response: bytes
-    tracks: EncodedTracks | None = None
-    problem: tuple[str, str] | None = None
-    events: schemas.Events | None = None
-
-    @classmethod
-    def of_tracks(cls, tracks: EncodedTracks, selection: Filter = EVERYTHING) -> Item:
-        payload = selection.of(tracks.message()).SerializeToString() if selection.key else tracks.payload
-        return cls(tracks.stream, b"".join((_TRACKS, varint(len(payload)), payload)), tracks)
-
-    @classmethod
-    def of_problem(cls, problem: schemas.Problem) -> Item:
-        response = pb.SubscribeResponse(problem=convert.to_proto(problem))
-        return cls(problem.stream, response.SerializeToString(), problem=(problem.code, problem.path))
+def problem_response(problem: schemas.Problem) -> bytes:
+    """Return a problem as a response of any streaming method."""
+    return pb.SubscribeResponse(problem=convert.to_proto(problem)).SerializeToString()
 
 
 class Listener:
-    """A call that receives items which the caches did not hold when they were asked. To be used on the loop.
+    """A call that receives messages which the caches did not hold when they were asked. To be used on the loop.
 
     At the next heartbeat of a publisher, recovery sends a subscriber that has heard nothing yet all that is cached.
 
     Args:
-        take: called with each new item.
+        take: called with each new message and its response; of events, of which each call makes its own, an empty one.
         selection: of its tracks.
         passes: whether it wants the tracks of a frame; called on a thread of the subscription.
     """
 
     def __init__(
         self,
-        take: Callable[[Item], None],
+        take: Callable[[Received, bytes], None],
         selection: Filter = EVERYTHING,
         passes: Callable[[EncodedTracks], bool] = lambda _: True,
     ) -> None:
@@ -96,23 +79,21 @@ class Listener:
         self.passes = passes
         self._take = take
         self._known: set[tuple[object, ...]] = set()
-        self._early: list[Item] | None = []  # items from before the answer of the caches
+        self._early: list[tuple[Received, bytes]] | None = []  # from before the answer of the caches
 
-    def put(self, item: Item) -> None:
-        """Pass on an item, now or when the caches have been asked, or leave it out."""
+    def put(self, message: Received, response: bytes) -> None:
+        """Pass on a message, now or when the caches have been asked, or leave it out."""
         if self._early is not None and len(self._early) < MAX_EARLY:
-            self._early.append(item)
-            return
-        of = item.tracks or item.events
-        if of is None or _publication(of) not in self._known:
-            self._take(item)
+            self._early.append((message, response))
+        elif isinstance(message, schemas.Problem) or _publication(message) not in self._known:
+            self._take(message, response)
 
     def begin(self, held: Iterable[EncodedTracks | schemas.Events]) -> None:
-        """Leave out the contents of the caches, and pass on the other items that came while they were asked."""
+        """Leave out the contents of the caches, and pass on what else came while they were asked."""
         self._known = {_publication(one) for one in held}
         early, self._early = self._early or [], None
-        for item in early:
-            self.put(item)
+        for message, response in early:
+            self.put(message, response)
 
 
 def _publication(one: EncodedTracks | schemas.Events) -> tuple[object, ...]:
@@ -135,7 +116,7 @@ class Network:
         self._shared: SharedSubscriptions[Listener, Arrival]
         self._shared = SharedSubscriptions(client.subscribe, self._receive, IDLE_SUBSCRIPTIONS)
         self._idle_publishers: IdlePool[Outgoing] = IdlePool(IDLE_PUBLISHERS)
-        self._arrived: collections.deque[tuple[Listener, Item]] = collections.deque()
+        self._arrived: collections.deque[tuple[Listener, Received, bytes]] = collections.deque()
         self._waking = False
 
     def close(self) -> None:
@@ -193,21 +174,22 @@ class Network:
 
     def _receive(self, listeners: tuple[Listener, ...], message: Arrival) -> None:
         """Take a message on the thread of its subscription."""
-        arrived: list[tuple[Listener, Item]] = []
+        arrived: list[tuple[Listener, Received, bytes]] = []
         topic = message.key.rpartition("/")[2]
         if not listeners:
             return
         if topic == "problems" and (problem := self._decoded(schemas.Problem, message)) is not None:
-            arrived = list(zip(listeners, itertools.repeat(Item.of_problem(problem))))
+            response = problem_response(problem)
+            arrived = [(one, problem, response) for one in listeners]
         elif topic == "events" and (events := self._decoded(schemas.Events, message)) is not None:
-            arrived = list(zip(listeners, itertools.repeat(Item(events.stream, b"", events=events))))
+            arrived = [(one, events, b"") for one in listeners]
         elif topic in {"tracks", "now"} and (tracks := self._tracks(message)) is not None:
             wanting = [one for one in listeners if one.passes(tracks)]
             selections = {one.selection.key: one.selection for one in wanting}
-            items = {key: Item.of_tracks(tracks, selection) for key, selection in selections.items()}
-            arrived = [(one, items[one.selection.key]) for one in wanting]
+            responses = {key: tracks_response(tracks, selection) for key, selection in selections.items()}
+            arrived = [(one, tracks, responses[one.selection.key]) for one in wanting]
         self._arrived.extend(arrived)
-        if arrived and not self._waking:  # items that are added after this are still handed over
+        if arrived and not self._waking:  # messages that are added after this are still handed over
             self._waking = True
             with contextlib.suppress(RuntimeError):  # the loop has ended
                 self._loop.call_soon_threadsafe(self._hand_over)
@@ -216,8 +198,8 @@ class Network:
         """Hand over all that has come, on the loop, which is woken once for it."""
         self._waking = False
         while self._arrived:
-            listener, item = self._arrived.popleft()
-            listener.put(item)
+            listener, message, response = self._arrived.popleft()
+            listener.put(message, response)
 
     def _tracks(self, message: Answer | Arrival) -> EncodedTracks | None:
         try:

@@ -12,7 +12,7 @@ from optipmb_schemas.protobuf import convert
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.edges.grpc.calls import EndCall
-from optipmb_service.edges.grpc.network import Item, Listener
+from optipmb_service.edges.grpc.network import Listener, tracks_response
 from optipmb_service.edges.grpc.selection import EventSelection, Filter
 from optipmb_service.edges.readers import Outbox, Pace, listed
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from optipmb_schemas.protobuf.convert import EncodedTracks
 
     from optipmb_service.edges.grpc.calls import Call
+    from optipmb_service.edges.grpc.network import Received
 
     T = TypeVar("T", bound=schemas.Message)
 
@@ -53,8 +54,8 @@ async def subscribe(call: Call) -> None:
     def passes(one: EncodedTracks) -> bool:
         return pace.passes(one.stream, one.predicted_to_ns or one.stamp_ns)
 
-    def put(item: Item) -> None:
-        outbox.put(item.stream, item.response, len(item.response))
+    def put(message: Received, response: bytes) -> None:
+        outbox.put(message.stream, response, len(response))
 
     listener = Listener(put, selection, passes)
     async with contextlib.AsyncExitStack() as subscriptions:
@@ -65,7 +66,7 @@ async def subscribe(call: Call) -> None:
         await call.begin()
         for one in history if asked.history else ():
             if passes(one):
-                await call.write(Item.of_tracks(one, selection).response)
+                await call.write(tracks_response(one, selection))
         listener.begin(history)
         await call.drain(outbox)
     call.check_ending()
@@ -79,9 +80,9 @@ async def subscribe_events(call: Call) -> None:
     chosen = EventSelection(asked)
     outbox: Outbox[bytes] = Outbox(MAX_QUEUE)
 
-    def take(item: Item) -> None:
-        for response in chosen.responses(item.events):
-            outbox.put(item.stream, response, len(response))
+    def take(message: Received, _: bytes) -> None:
+        for response in chosen.responses(message) if isinstance(message, schemas.Events) else ():
+            outbox.put(message.stream, response, len(response))
 
     listener = Listener(take)
     async with network.subscribed(key, listener):
@@ -107,12 +108,12 @@ async def query_tracks(call: Call) -> None:
     )
     if "*" not in asked.pattern:
         async for tracks in _kept(call, asked.pattern, wanted):
-            await call.write(Item.of_tracks(tracks, selection).response)
+            await call.write(tracks_response(tracks, selection))
         return
     last = 2**63 if wanted.to_ns is None else wanted.to_ns
     for tracks in _newest(await call.gateway.network.recent(key)):
         if wanted.from_ns <= tracks.stamp_ns <= last:
-            await call.write(Item.of_tracks(tracks, selection).response)
+            await call.write(tracks_response(tracks, selection))
 
 
 async def get_state(call: Call) -> None:

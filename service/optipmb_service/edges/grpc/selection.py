@@ -107,10 +107,8 @@ class EventSelection:
         self._final = asked.final or not asked.HasField("final")
         self._streams = FinalEventsOfStreams()
 
-    def responses(self, message: schemas.Events | None) -> list[bytes]:
+    def responses(self, message: schemas.Events) -> list[bytes]:
         """Return the responses that a message makes due."""
-        if message is None:
-            return []
         due = self._streams.take(message) if self._final else [message]
         return [
             pb.SubscribeEventsResponse(events=convert.to_proto(one)).SerializeToString()
