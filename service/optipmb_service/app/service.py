@@ -192,9 +192,11 @@ class Service(Component):
             self._streams.finish()  # else what waits for its cloud comes again from the publishers' caches
         while self._streams.busy and grace.left():
             time.sleep(DRAIN_POLL_S)
-        ended = self._scheduler.close(JOIN_S)
+        ended = self._scheduler.close(max(JOIN_S, ends.left() - SAVE_S - LEASES_S))
         if ended:
             self._streams.keep_now()
+        else:
+            log.error("step_hangs", steps=["tracking"])
         kept = self._checkpoints.close(max(SAVE_S, ends.left() - LEASES_S))
         self._member.close(ends.left())
         if self._log is not None:

@@ -132,7 +132,10 @@ EVENTS: Final = {
         "+ `grace_s`."
     ),
     "stop_asked_again": "Another signal, which has no effect.",
-    "step_hangs": "`steps` of the end do not return; checkpoints are written all the same. The exit status is 1.",
+    "step_hangs": (
+        "`steps` of the end do not return. Checkpoints are written all the same; where `tracking` is among them, of "
+        "older states. The exit status is 1."
+    ),
     "end_hangs": "The end took too long, and the process was ended with status 1. `threads` is where each thread was.",
     "end_unbounded": "No thread can be started (a limit of processes or memory): the end may take any time.",
     "stopped": "The service has stopped; `drained` is false when not all is done.",

@@ -22,11 +22,14 @@ from optipmb_service.session.session import Session
 from optipmb_service.streams.persistence import CheckpointWriter
 from optipmb_service.streams.stream import Stream
 from router import Node, Sensor, plain, until
+from sessions import Gated
 
 import optipmb
 
 KEYS = Keys()
 SENSOR = Sensor()
+LONG_STEP_S = 1.0
+"""Longer than the grace of these services."""
 STREAMS = int(os.environ.get("OPTIPMB_TEST_STREAMS", "100"))
 
 
@@ -69,12 +72,30 @@ def test_a_store_that_hangs_keeps_no_end_waiting(start: Callable[..., Any], tmp_
         for file in files:
             file._lock.acquire()  # as by a call that does not return
         ended: list[bool] = []
-        ending = threading.Thread(target=lambda: ended.append(service.stop()), daemon=True)
+        ending = threading.Thread(target=lambda: ended.append(service.stop(2.0)), daemon=True)
         ending.start()
         ending.join(60.0)
         for file in files:
             file._lock.release()
     assert ended == [False]  # nothing was kept
+
+
+def test_the_last_checkpoint_waits_for_a_long_step(start: Callable[..., Any], tmp_path: Path) -> None:
+    """A step that ends after the grace, while there is time for the checkpoint, is in it."""
+    gated = Gated(first=5)
+    service, endpoint = start(tracker=gated.tracker, store=str(tmp_path))
+    with Node(endpoint) as node:
+        node.send(*(SENSOR.detections(seq) for seq in range(5)))
+        session = node.tracks(SENSOR.stream, 4)[-1].session
+        assert gated.entered.wait(60)
+        threading.Timer(LONG_STEP_S, gated.gate.set).start()
+        assert service.stop()
+    _, endpoint = start(store=str(tmp_path))
+    with Node(endpoint) as node:
+        node.send(SENSOR.detections(5))
+        node.tracks(SENSOR.stream, 1)
+        asked = node.ask(KEYS.query(SENSOR.stream, "state"), SessionState)
+    assert (asked.session, asked.frames) == (session, 6)
 
 
 def test_a_closed_stream_that_moves_stays_closed(start: Callable[..., Any], tmp_path: Path) -> None:

@@ -41,6 +41,7 @@ from optipmb_service.zenoh.transport import Transport
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_router
 from sessions import Gated
+from structlog.testing import capture_logs
 
 import optipmb
 
@@ -385,14 +386,15 @@ def test_a_silent_stream_is_stale(start: Callable[..., Any]) -> None:
 
 
 def test_a_step_that_does_not_end_does_not_keep_the_service(start: Callable[..., Any]) -> None:
-    """Stopping gives up on a stuck step after the grace and closes the network all the same."""
+    """Stopping gives up on a stuck step in time, says so, and closes the network all the same."""
     gated = Gated()
 
     service, endpoint = start(tracker=gated.tracker, grace_s=0.2)
-    with Node(endpoint) as node:
+    with Node(endpoint) as node, capture_logs() as logs:
         node.send(SENSOR.detections(0))
         assert gated.entered.wait(60)
-        assert not service.stop()
+        assert not service.stop(1.0)
+    assert {"event": "step_hangs", "steps": ["tracking"], "log_level": "error"} in logs
     gated.gate.set()
 
 
