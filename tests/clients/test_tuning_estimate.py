@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from optipmb_tools.datasets import open_dataset
 from optipmb_tools.tuning.clips import load, of_class
-from optipmb_tools.tuning.estimate import Estimate, estimate, spread, usual
+from optipmb_tools.tuning.estimate import Estimate, estimate, fit_motion, spread, usual
 from optipmb_tools.tuning.scoring import rules_of
 from optipmb_tools.tuning.values import only
 from tuning_cases import Habits, Recorded, recorded
@@ -95,3 +95,17 @@ def test_a_few_gross_errors_do_not_carry_a_spread_away() -> None:
     assert spread(errors) < 1.5
     assert usual(errors) == pytest.approx(1.0, abs=0.1)
     assert errors.std() > 5.0
+
+
+def test_the_variances_of_a_fit_are_those_of_its_errors() -> None:
+    """Speed, acceleration, heading and turn rate of many noisy pieces scatter about the truth as their fits say."""
+    rng = np.random.default_rng(0)
+    pieces, points = 400, 12
+    time = np.linspace(0.0, pieces, pieces * points, endpoint=False)
+    yaw = 0.1 + rng.normal(0.0, 0.02, len(time))
+    position = np.column_stack((5.0 * time * np.cos(0.1), 5.0 * time * np.sin(0.1))) + rng.normal(
+        0.0, 0.1, (len(time), 2)
+    )
+    found = fit_motion(time, position, yaw, 1.0)
+    errors = np.column_stack((found.speed - 5.0, found.acceleration, found.heading - 0.1, found.turn_rate))
+    np.testing.assert_allclose((errors**2).mean(axis=0), found.variance.mean(axis=0), rtol=0.2)

@@ -42,6 +42,7 @@ from optipmb.learning.self_calibration import (
     learn,
     learn_scatter,
     learned,
+    learned_noise,
     needed_shares,
     squares,
     use_scatter,
@@ -469,6 +470,17 @@ def test_a_stored_density_goes_on_to_the_last_bit() -> None:
     for one in frames[25:]:
         density = tracker.step(density, optipmb.make_frame(PARAMETERS, **one)[0]).density
     assert optipmb.bytes_of(density) == optipmb.bytes_of(wanted[-1].density)
+
+
+def test_learned_noise_is_said_in_words_by_class() -> None:
+    """The line of a class has its own scatter; a class with few pairs has none, nor a density without counts."""
+    density = run(PARAMETERS, street(1))[-1].density
+    own = density.self_calibration
+    assert own is not None
+    scatter = np.array([[PRIOR_PAIRS - 1, 9.0, 9.0], [100.0, 100 * 0.3**2, 100 * 0.5**2]])
+    known = replace(density, self_calibration=replace(own, scatter=scatter, lagged=np.zeros_like(own.lagged)))
+    assert learned_noise(known) == (f"{CLASSES[1]}: 0.41 m scatter, 0.34 m lasting",)
+    assert learned_noise(replace(density, self_calibration=None)) == ()
 
 
 def test_wrong_counts_are_refused_by_name() -> None:

@@ -4,7 +4,8 @@ import threading
 from types import SimpleNamespace
 from typing import Any
 
-from optipmb_schemas import DrainRequest, Keys, encode, encoding_of
+import pytest
+from optipmb_schemas import DrainRequest, Keys, Message, MoveRequest, encode, encoding_of
 from optipmb_service.app.workers import AggregateView, Worker
 from optipmb_service.settings import load
 from optipmb_service.telemetry.metrics import Metrics
@@ -29,21 +30,43 @@ class Network:
             assert self.gate.wait(HANGS_S)
 
 
+def parent(network: Any, metrics: Metrics) -> AggregateView:
+    supervisor: Any = SimpleNamespace(workers=[Worker(0), Worker(1)], began=True)
+    return AggregateView(load(None, {"instance": "yard", "store": "none"}).settings, supervisor, network, metrics)
+
+
+def order(key: str, asked: Message, **calls: Any) -> Any:
+    """Return a query with a request."""
+    encoding = encoding_of(type(asked))
+    return SimpleNamespace(key=key, payload=encode(asked), encoding=encoding, finish=lambda: None, **calls)
+
+
+@pytest.mark.parametrize(
+    ("key", "asked"),
+    [(KEYS.move("yard"), MoveRequest(stream="a/b/c", worker=1)), (KEYS.drain("yard"), DrainRequest(drain=False))],
+)
+def test_an_order_that_workers_have_done_is_answered_with_itself(key: str, asked: Message) -> None:
+    """At the key that was asked; the order is what the workers got."""
+    ordered: list[bytes] = []
+    answers: list[tuple[object, ...]] = []
+
+    def ask(_key: str, _timeout: float, payload: bytes, _encoding: str) -> bytes:
+        ordered.append(payload)
+        return payload
+
+    view = parent(SimpleNamespace(client=Network().client, ask=ask), Metrics())
+    view.answer(order(key, asked, answer=lambda *one: answers.append(one)))
+    view.ends()
+    assert answers == [(key, asked)]
+    assert set(ordered) == {encode(asked)}
+
+
 def test_a_drain_keeps_no_status_waiting() -> None:
     """While the workers are asked to leave their streams, status and metrics are answered."""
-    network: Any = Network()
-    supervisor: Any = SimpleNamespace(workers=[Worker(0), Worker(1)], began=True)
-    settings, metrics = load(None, {"instance": "yard", "store": "none"}).settings, Metrics()
-    view = AggregateView(settings, supervisor, network, metrics)
+    network, metrics = Network(), Metrics()
+    view = parent(network, metrics)
     refused: list[object] = []
-    asked = DrainRequest(drain=False)
-    request: Any = SimpleNamespace(
-        key=KEYS.drain("yard"),
-        payload=encode(asked),
-        encoding=encoding_of(asked),
-        refuse=refused.append,
-        finish=lambda: None,
-    )
+    request = order(KEYS.drain("yard"), DrainRequest(drain=False), refuse=refused.append)
     draining = threading.Thread(target=view.answer, args=(request,), daemon=True)
     draining.start()
     assert network.asked.wait(HANGS_S)
