@@ -12,7 +12,7 @@ from typing import Self
 import pytest
 from routers import free_endpoint
 
-CONNECT, CONNACK, PUBLISH, PUBACK, DISCONNECT = 0x10, 0x20, 0x30, 0x40, 0xE0
+CONNECT, CONNACK, PUBLISH, PUBACK, SUBSCRIBE, DISCONNECT = 0x10, 0x20, 0x30, 0x40, 0x80, 0xE0
 NOT_ALLOWED, TAKEN_OVER = 135, 142
 
 
@@ -34,6 +34,7 @@ class Broker:
         most: size of the largest packet that it takes, 0: any; a larger one ends the connection.
         says_most: whether it says so.
         denied: ends of topics that it refuses.
+        kinds: of the packets that came.
     """
 
     versions: tuple[int, ...] = (4, 5)
@@ -41,6 +42,7 @@ class Broker:
     most: int = 0
     says_most: bool = True
     denied: tuple[str, ...] = ()
+    kinds: list[int] = field(default_factory=list)
     connections: int = 0
     messages: list[Message] = field(default_factory=list)
     wills: list[str] = field(default_factory=list)
@@ -80,6 +82,7 @@ class Broker:
             while True:
                 kind = (await reader.readexactly(1))[0]
                 body = await reader.readexactly(await _length(reader))
+                self.kinds.append(kind & 0xF0)
                 if self.most and len(body) > self.most:
                     break
                 if kind == CONNECT:

@@ -116,6 +116,7 @@ class Node:
         self._closing: list[Callable[[], object]] = []
         self.tracks_seen = self._collect(self.keys.all("tracks"))
         self.problems_seen = self._collect(self.keys.all("problems"))
+        self.alive(self.keys.all_owners())  # the answer comes after the router knows the subscriptions
 
     def __enter__(self) -> Self:
         return self

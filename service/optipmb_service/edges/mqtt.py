@@ -359,12 +359,12 @@ class Bridge(Component):
         self._most = await link.open(broker.hostname or "", broker.port or PORTS[broker.scheme])
         self._largest.clear()
         self._opened.append(time.monotonic())
+        self._denied = link.denied
+        for topic, qos in self._sources.topics:  # first: who sends once this bridge is alive is heard
+            link.subscribe(topic, qos)
         self._note(self._alive, await link.publish(self._alive, b"1", 1, retain=True))
         self.connected, self._why = True, ""
         log.info("mqtt_connected", broker=self._mqtt.broker, protocol=self._version.name, most_bytes=self._most)
-        self._denied = link.denied
-        for topic, qos in self._sources.topics:
-            link.subscribe(topic, qos)
         publishing = asyncio.create_task(self._publish(link))
         clearing = asyncio.create_task(self._clear(link))
         try:

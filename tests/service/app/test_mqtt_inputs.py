@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from broker import CONNACK, CONNECT, PUBLISH, mosquitto
+from broker import CONNACK, CONNECT, PUBLISH, SUBSCRIBE, Broker, mosquitto
 from json_senders import damaged, document, exists
 from optipmb_schemas import Detections, Keys, MessageError, decode
 from optipmb_service.edges.json_frames import FrameReader
@@ -125,6 +125,16 @@ async def test_frames_over_mqtt_give_the_same_bytes(start: Any, tmp_path: Path) 
             assert [plain(one) for one in tracks[: len(messages)]] == expected
             assert sum(bridge.inputs.refused.values()) == 2
             assert bridge.inputs.frames["mqtt"] == 2 * len(messages) + 1, "the retained one is old"
+
+
+async def test_inputs_are_subscribed_before_the_bridge_is_alive() -> None:
+    """Who sends when the bridge says that it is alive is heard from the first message on."""
+    endpoint, inputs = free_endpoint(), {SENSOR.stream: {"topic": "sensor"}}
+    async with Broker() as broker:
+        address = f"mqtt://127.0.0.1:{broker.port}"
+        async with bridged(endpoint, address, inputs, connect=[], listen=[endpoint], router=True):
+            await broker.wait(1, "/alive")
+    assert broker.kinds[:3] == [CONNECT, SUBSCRIBE, PUBLISH]
 
 
 async def test_frames_keep_their_order_while_nothing_is_tracked(tmp_path: Path) -> None:
