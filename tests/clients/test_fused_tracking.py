@@ -13,7 +13,7 @@ from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
 from optipmb_tools.datasets import DatasetError, open_dataset
 from optipmb_tools.datasets.fused import FusedSequence
-from optipmb_tools.recordings.files import RecordingWriter
+from optipmb_tools.recordings.recording_file import RecordingWriter
 from optipmb_tools.run.profiles import read_sensors
 from optipmb_tools.run.tracking import Tracking, track_whole
 from sessions import Merged

@@ -35,8 +35,8 @@ from optipmb_schemas import (
     encoding_of,
 )
 from optipmb_tools.datasets import DatasetError, dataset_at, open_dataset
-from optipmb_tools.recordings.files import Recorded, RecordingFile, RecordingWriter
 from optipmb_tools.recordings.plan import plan, steps
+from optipmb_tools.recordings.recording_file import Recorded, RecordingFile, RecordingWriter
 from optipmb_tools.views.foxglove import FoxgloveServer
 from tracks_message import tracks_message
 

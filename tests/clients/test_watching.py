@@ -15,7 +15,7 @@ from commands import start
 from optipmb_client.incoming import Answer, Inbox
 from optipmb_schemas import Density, Detections, Keys, Points, Pose, Tracks, encode, encoding_of
 from optipmb_tools.cli import run
-from optipmb_tools.recordings.files import RecordingWriter
+from optipmb_tools.recordings.recording_file import RecordingWriter
 from optipmb_tools.views.colours import COLOURS, colour_of, rgb_of
 from optipmb_tools.views.viewer import LEGEND, DensityQueries, View
 from routers import free_endpoint

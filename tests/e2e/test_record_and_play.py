@@ -17,7 +17,7 @@ from optipmb_client import Connection, Subscriber
 from optipmb_schemas import Tracks, decode, encode
 from optipmb_tools.cli import run
 from optipmb_tools.datasets import Dataset, DatasetError, open_dataset
-from optipmb_tools.recordings.files import RecordingFile
+from optipmb_tools.recordings.recording_file import RecordingFile
 from optipmb_tools.run.replay import Replaying, ReplayPace, replay
 from real_data import REPOSITORY
 from service_process import ServiceProcess

@@ -11,7 +11,7 @@ from optipmb_schemas import PATHS, Detections, Keys, encode, encoding_of
 from optipmb_service.session.outputs import TrackedFrame
 from optipmb_service.session.session import Session
 from optipmb_tools.datasets import open_dataset
-from optipmb_tools.recordings.files import RecordingWriter
+from optipmb_tools.recordings.recording_file import RecordingWriter
 from optipmb_tools.run.tracking import Tracking, track_whole
 from router import Sensor
 from service_process import ServiceProcess

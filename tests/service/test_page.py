@@ -15,7 +15,7 @@ from optipmb_service.app import cli
 from optipmb_service.cluster import message_log, sqlite
 from optipmb_service.edges import inputs as edge_inputs
 from optipmb_service.edges import json_frames, mqtt, mqtt_inputs, readers
-from optipmb_service.edges.grpc import calls, inputs, outputs
+from optipmb_service.edges.grpc import calls, publishing, subscribing
 from optipmb_service.edges.grpc.server import OPTIONS
 from optipmb_service.edges.http import detections, server
 from optipmb_service.session.problems import CODES
@@ -127,10 +127,10 @@ FIGURES = {
     "grpc.md": {
         f"size of a message | {schemas.DEFAULT.max_bytes // 2**20} MB |",
         f"points of a cloud | {schemas.DEFAULT.max_detections:,}, {schemas.DEFAULT.max_points:,} |",
-        f"`Publish` | {inputs.MAX_CACHE:,}, {inputs.MAX_CACHE_CLOUDS} |",
-        f"(default {outputs.QUEUE}, at most {outputs.MAX_QUEUE}), {readers.BYTES // 2**20} MB in total",
+        f"`Publish` | {publishing.MAX_CACHE:,}, {publishing.MAX_CACHE_CLOUDS} |",
+        f"(default {subscribing.QUEUE}, at most {subscribing.MAX_QUEUE}), {readers.BYTES // 2**20} MB in total",
         f"no message within {calls.FIRST_S:.0f} s of opening a call",
-        f"no service answered within {outputs.QUERY_S:.0f} s",
+        f"no service answered within {subscribing.QUERY_S:.0f} s",
         f"`grpc_calls` ({default('grpc_calls'):,}), `grpc_connections` ({default('grpc_connections'):,})",
         f"metadata of a call | {options['grpc.max_metadata_size'] // 2**10} KiB |",
         f"at least {options['grpc.http2.min_ping_interval_without_data_ms'] // 1000} s |",

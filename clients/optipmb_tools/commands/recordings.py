@@ -118,9 +118,9 @@ def play(
     different.
     """
     needed("recordings", "record", "mcap", need="need")
-    from optipmb_tools.recordings.files import RecordingFile  # noqa: PLC0415  packages of an extra
     from optipmb_tools.recordings.play import Playing, choose  # noqa: PLC0415  as above
     from optipmb_tools.recordings.play import play as play_streams  # noqa: PLC0415  as above
+    from optipmb_tools.recordings.recording_file import RecordingFile  # noqa: PLC0415  packages of an extra
 
     chosen_pace = pace.pace()
     recording = RecordingFile(file)

@@ -168,7 +168,7 @@ def _live(service: ServiceOptions, timeout: float, how: WatchOptions) -> Iterato
 def _recorded(file: Path, speed: float | None, how: WatchOptions) -> Iterator[Message | None]:
     """Yield the messages of a recording, at its pace."""
     needed("recordings", "record", "mcap", need="need")
-    from optipmb_tools.recordings.files import RecordingFile  # noqa: PLC0415  packages of an extra
+    from optipmb_tools.recordings.recording_file import RecordingFile  # noqa: PLC0415  packages of an extra
 
     zero: float | None = None
     for one in RecordingFile(file):

@@ -19,8 +19,8 @@ from optipmb_tools.camera import synthetic_camera
 from optipmb_tools.datasets.interface import IDENTITY, Cloud, DataSequence, Dataset, DetectionFrame
 from optipmb_tools.files import DatasetError
 from optipmb_tools.geometry import Floats, Pose, box_columns, rotation_of, to_sensor
-from optipmb_tools.recordings.files import Recorded, RecordingFile
 from optipmb_tools.recordings.plan import StreamPlan, plan, steps
+from optipmb_tools.recordings.recording_file import Recorded, RecordingFile
 from optipmb_tools.results.kitti import write_kitti_results
 
 

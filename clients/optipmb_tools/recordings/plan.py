@@ -11,7 +11,7 @@ from typing import Final, TypeAlias, TypeVar
 
 from optipmb_schemas import Detections, Message, MessageError, SessionParameters, Tracks, decode, encode, encoding_of
 
-from optipmb_tools.recordings.files import KINDS, Recorded
+from optipmb_tools.recordings.recording_file import KINDS, Recorded
 
 FrameId: TypeAlias = tuple[bytes, int]  # epoch and sequence number
 

@@ -16,8 +16,8 @@ from optipmb_client.zenoh import Connection
 from optipmb_client.zenoh.handles import Sender
 from optipmb_schemas import PREFIX, Keys, Problem, SessionParameters, Tracks
 
-from optipmb_tools.recordings.files import Recorded, RecordingFile
 from optipmb_tools.recordings.plan import FrameId, Step, StreamPlan, content, plan, renamed, steps
+from optipmb_tools.recordings.recording_file import Recorded, RecordingFile
 from optipmb_tools.results.output import Latency, latency
 from optipmb_tools.run.replay import CLOUD_WAIT_S, Exchange, ReplayPace, await_wanted
 

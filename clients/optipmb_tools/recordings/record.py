@@ -20,7 +20,7 @@ from optipmb_client.sessions import set_parameters
 from optipmb_client.zenoh import Connection
 from optipmb_schemas import PREFIX, Keys, MessageError, SessionParameters, Topic, Tracks, encode, encoding_of
 
-from optipmb_tools.recordings.files import RecordingWriter
+from optipmb_tools.recordings.recording_file import RecordingWriter
 
 SMALL: tuple[Topic, ...] = ("detections", "tracks", "problems")
 SMALL_QUEUE = 16_384

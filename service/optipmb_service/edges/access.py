@@ -61,11 +61,11 @@ class Caller:
 
     def may_publish(self, stream: str) -> None:
         """Raise NotAllowedError unless the caller may publish a stream."""
-        self._check(self.name == ANYBODY or self._owns(stream), f"publish {stream}")
+        self._check(f"publish {stream}", allowed=self.name == ANYBODY or self._owns(stream))
 
     def may_read(self, pattern: str) -> None:
         """Raise NotAllowedError unless the caller may read all streams of a pattern."""
-        self._check(self.can_read(pattern), f"read {pattern}")
+        self._check(f"read {pattern}", allowed=self.can_read(pattern))
 
     def can_read(self, pattern: str) -> bool:
         """Return whether the caller may read all streams of a pattern."""
@@ -73,7 +73,8 @@ class Caller:
 
     def may_command(self, stream: str) -> None:
         """Raise NotAllowedError unless the caller may reset a stream and set its parameters."""
-        self._check(self.name == ANYBODY or self._role == "service" or self._owns(stream), f"command {stream}")
+        allowed = self.name == ANYBODY or self._role == "service" or self._owns(stream)
+        self._check(f"command {stream}", allowed=allowed)
 
     @property
     def pattern(self) -> str:
@@ -88,7 +89,7 @@ class Caller:
     def _owns(self, stream: str) -> bool:
         return not self._role and NAME.fullmatch(self.name) is not None and stream.startswith(f"{self.name}/")
 
-    def _check(self, allowed: bool, what: str) -> None:  # noqa: FBT001 - the one thing that it is given
+    def _check(self, what: str, *, allowed: bool) -> None:
         if not allowed:
             raise NotAllowedError(f"{self.name} may not {what}")
 

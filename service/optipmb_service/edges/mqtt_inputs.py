@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import re
 import weakref
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final
 
 import optipmb_schemas as schemas
 import structlog
@@ -37,13 +37,6 @@ PAUSE_S: Final = 0.2
 log = structlog.get_logger("optipmb_service")
 
 
-class _InputTopic(NamedTuple):
-    """An input of the settings."""
-
-    topic: re.Pattern[str]
-    stream: str
-
-
 class MqttInputs:
     """Takes the messages of input topics. Create and use it on one loop.
 
@@ -59,7 +52,7 @@ class MqttInputs:
         self._inputs = inputs
         self._own = f"{settings.prefix}/"
         self._rows = [
-            _InputTopic(re.compile(re.escape(one.pattern).replace(r"\+", "([^/]*)")), stream)
+            (re.compile(re.escape(one.pattern).replace(r"\+", "([^/]*)")), stream)
             for stream, one in settings.mqtt.inputs.items()
         ]
         self._tasks: set[asyncio.Task[None]] = set()
@@ -67,8 +60,8 @@ class MqttInputs:
 
     def take(self, message: Any, confirm: Callable[[], object]) -> None:
         """Take a message of paho's; `confirm` is called when it is done with."""
-        matches = ((row, row.topic.fullmatch(message.topic)) for row in self._rows if not message.retain)
-        found = [row.stream.format("", *match.groups()) for row, match in matches if match]
+        matches = ((stream, topic.fullmatch(message.topic)) for topic, stream in self._rows if not message.retain)
+        found = [stream.format("", *match.groups()) for stream, match in matches if match]
         fits = len(message.payload) <= self._most_bytes  # a larger one is refused
         stream = next((one for one in found if not fits or self._is_of(message.payload, one)), None)
         if stream is None:  # an old message, counts that the bridge publishes, or the payload of another sensor

@@ -21,7 +21,7 @@ from optipmb_client.errors import ConnectionFailed as TransportError
 from optipmb_schemas.protobuf import tracking_pb2 as pb
 
 from optipmb_service.edges.access import NotAllowedError
-from optipmb_service.edges.grpc import inputs, outputs
+from optipmb_service.edges.grpc import publishing, subscribing
 from optipmb_service.edges.grpc.access import Access, credentials
 from optipmb_service.edges.grpc.calls import Call, CallerGoneError, EndCall, ending_with_caller
 from optipmb_service.edges.grpc.network import Network
@@ -38,16 +38,16 @@ if TYPE_CHECKING:
 SERVICE: Final = pb.DESCRIPTOR.services_by_name["TrackingService"].full_name
 
 METHODS: Final[dict[str, Callable[[Call], Awaitable[None]]]] = {
-    "Track": inputs.track,
-    "Publish": inputs.publish,
-    "Subscribe": outputs.subscribe,
-    "SubscribeEvents": outputs.subscribe_events,
-    "QueryTracks": outputs.query_tracks,
-    "GetState": outputs.get_state,
-    "GetLinks": outputs.get_links,
-    "Reset": outputs.reset,
-    "SetParameters": outputs.set_parameters,
-    "ListStreams": outputs.list_streams,
+    "Track": publishing.track,
+    "Publish": publishing.publish,
+    "Subscribe": subscribing.subscribe,
+    "SubscribeEvents": subscribing.subscribe_events,
+    "QueryTracks": subscribing.query_tracks,
+    "GetState": subscribing.get_state,
+    "GetLinks": subscribing.get_links,
+    "Reset": subscribing.reset,
+    "SetParameters": subscribing.set_parameters,
+    "ListStreams": subscribing.list_streams,
 }
 
 SAID_BY: Final = "optipmb-gateway"
