@@ -105,7 +105,7 @@ class Session:
         found = [(at, one) for at, one in self.cache if fnmatch.fnmatchcase(at, key)]
         return [Answer(at, encode(one), encoding_of(one), ok=True) for at, one in found]
 
-    def alive(self, pattern: str, *, timeout: float) -> list[str]:
+    def alive(self, pattern: str, *, timeout: float = 2.0) -> list[str]:
         assert pattern == KEYS.all_alive()
         assert timeout
         return [KEYS.alive(one) for one in self.instances]
