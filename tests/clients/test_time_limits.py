@@ -14,8 +14,8 @@ import optipmb_tools.recordings.record
 import optipmb_tools.run.replay
 import pytest
 from optipmb_client import ConnectionFailed
+from optipmb_service.app.configuration import load
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.settings import load
 
 LIMIT_S = 7.3
 

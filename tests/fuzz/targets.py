@@ -11,7 +11,7 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_schemas.protobuf.convert import transcode
 from optipmb_service.edges.grpc.selection import Filter
 from optipmb_service.edges.json_frames import FrameReader
-from optipmb_service.edges.readers import Pace
+from optipmb_service.edges.queues import Pace
 from optipmb_service.session.checkpoint import CheckpointError, decode_checkpoint, encode_checkpoint, seal
 from optipmb_service.session.convert import density_of
 from optipmb_service.session.identity import Incarnation

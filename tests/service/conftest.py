@@ -9,8 +9,8 @@ import time
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from optipmb_service.app.configuration import load
 from optipmb_service.app.service import Service
-from optipmb_service.settings import load
 from optipmb_service.streams.profiles import Profiles
 from router import Node
 from routers import free_endpoint

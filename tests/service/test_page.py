@@ -12,14 +12,15 @@ import pytest
 from optipmb_client import publisher
 from optipmb_schemas import Code
 from optipmb_service.app import cli
+from optipmb_service.app.configuration import load
 from optipmb_service.cluster import message_log, sqlite
 from optipmb_service.edges import inputs as edge_inputs
-from optipmb_service.edges import json_frames, mqtt, mqtt_inputs, readers
+from optipmb_service.edges import json_frames, mqtt, mqtt_inputs, queues, readers
 from optipmb_service.edges.grpc import calls, publishing, subscribing
 from optipmb_service.edges.grpc.server import OPTIONS
 from optipmb_service.edges.http import detections, server
 from optipmb_service.session.problems import CODES
-from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, SiteSettings, load
+from optipmb_service.settings import LimitSettings, Ros2Settings, Ros2Stream, Settings, SiteSettings
 from optipmb_service.streams import persistence
 from optipmb_service.telemetry.logs import EVENTS
 from optipmb_service.zenoh import transport
@@ -128,7 +129,7 @@ FIGURES = {
         f"size of a message | {schemas.DEFAULT.max_bytes // 2**20} MB |",
         f"points of a cloud | {schemas.DEFAULT.max_detections:,}, {schemas.DEFAULT.max_points:,} |",
         f"`Publish` | {publishing.MAX_CACHE:,}, {publishing.MAX_CACHE_CLOUDS} |",
-        f"(default {subscribing.QUEUE}, at most {subscribing.MAX_QUEUE}), {readers.BYTES // 2**20} MB in total",
+        f"(default {subscribing.QUEUE}, at most {subscribing.MAX_QUEUE}), {queues.BYTES // 2**20} MB in total",
         f"no message within {calls.FIRST_S:.0f} s of opening a call",
         f"no service answered within {subscribing.QUERY_S:.0f} s",
         f"`grpc_calls` ({default('grpc_calls'):,}), `grpc_connections` ({default('grpc_connections'):,})",

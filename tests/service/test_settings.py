@@ -4,7 +4,7 @@ import re
 from typing import Any
 
 import pytest
-from optipmb_service.settings import SettingsInvalidError, load
+from optipmb_service.app.configuration import SettingsInvalidError, load
 
 INPUTS: dict[str, dict[str, Any]] = {
     "a/b": {"a/b": {"topic": "x"}},

@@ -10,8 +10,9 @@ from types import SimpleNamespace
 from typing import Any, Self
 
 from optipmb_schemas import Detections
+from optipmb_service.app.configuration import load
 from optipmb_service.edges.http import Server, application
-from optipmb_service.settings import Settings, load
+from optipmb_service.settings import Settings
 from optipmb_service.telemetry.health import Component, ProcessHealth
 from optipmb_service.telemetry.metrics import Metrics
 from optipmb_service.zenoh.client import Client

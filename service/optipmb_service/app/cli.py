@@ -25,6 +25,7 @@ from typer.main import get_command
 
 from optipmb_service import __version__
 from optipmb_service.app import ENDING, WRONG_USE, health_command
+from optipmb_service.app.configuration import Loaded, SettingsInvalidError, load, missing_files
 from optipmb_service.app.lifecycle import leave_or_restart
 from optipmb_service.app.processes import run_bridge, run_gateway, run_link, run_log, run_ros2, run_router
 from optipmb_service.cluster.store import StoreError
@@ -32,12 +33,8 @@ from optipmb_service.settings import (
     DEFAULT_GRPC,
     DEFAULT_LISTEN,
     DEFAULT_NATS,
-    Loaded,
     Settings,
-    SettingsInvalidError,
     address,
-    load,
-    missing_files,
     state_home,
     without_password,
 )

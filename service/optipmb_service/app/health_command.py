@@ -79,7 +79,7 @@ def _address(option: str | None, file: Path | None) -> tuple[str, Path | None]:
     address, folder = option or os.environ.get("OPTIPMB_HTTP", ""), os.environ.get("OPTIPMB_HTTP_TLS", "")
     certificate = Path(folder) if folder else None
     if file is not None and not (address and certificate):
-        from optipmb_service.settings import load  # noqa: PLC0415 - only this needs the libraries behind it
+        from optipmb_service.app.configuration import load  # noqa: PLC0415 - only this needs the libraries behind it
 
         settings = load(file).settings
         address, certificate = address or settings.http, settings.http_tls

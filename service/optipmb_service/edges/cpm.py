@@ -16,7 +16,7 @@ import numpy as np
 import structlog
 from optipmb_schemas import json_form
 
-from optipmb_service.edges.readers import Pace
+from optipmb_service.edges.queues import Pace
 
 if TYPE_CHECKING:
     from collections import Counter

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 from optipmb_schemas import DrainRequest, Keys, Message, MoveRequest, encode, encoding_of
+from optipmb_service.app.configuration import load
 from optipmb_service.app.workers import AggregateView, Worker
-from optipmb_service.settings import load
 from optipmb_service.telemetry.metrics import Metrics
 
 KEYS = Keys()

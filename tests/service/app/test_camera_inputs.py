@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from optipmb_client.errors import ClientError
 from optipmb_schemas import Detections, MessageError
+from optipmb_service.app.configuration import load
 from optipmb_service.edges.json_frames import FrameReader, separate
-from optipmb_service.settings import load
 from router import Node
 from scipy.spatial.transform import Rotation
 

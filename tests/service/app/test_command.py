@@ -11,7 +11,7 @@ import pytest
 from optipmb_schemas import Keys, ServiceStatus, SessionParameters, decode
 from optipmb_schemas.installation import install_command
 from optipmb_service.app import cli, worker
-from optipmb_service.settings import load
+from optipmb_service.app.configuration import load
 from router import Node, Sensor
 from routers import free_endpoint, open_router
 from service_process import ServiceProcess

@@ -16,8 +16,9 @@ import pytest
 from optipmb_schemas import Detections
 from optipmb_schemas.ros2.cpm import CPM, cpm_fields, definitions
 from optipmb_schemas.ros2.types import own_types
+from optipmb_service.app.configuration import SettingsInvalidError, load
 from optipmb_service.edges.cpm import Station, station_of
-from optipmb_service.settings import Settings, SettingsInvalidError, load
+from optipmb_service.settings import Settings
 from tracks_message import tracks_message
 
 SECOND = 10**9

@@ -16,9 +16,9 @@ import pytest
 from broker import CONNACK, CONNECT, PUBLISH, SUBSCRIBE, Broker, mosquitto
 from json_senders import damaged, document, exists
 from optipmb_schemas import Detections, Keys, MessageError, decode
+from optipmb_service.app.configuration import load
 from optipmb_service.edges.json_frames import FrameReader
 from optipmb_service.edges.mapping import other_value
-from optipmb_service.settings import load
 from optipmb_service.zenoh.client import Client
 from router import Node, Sensor, plain
 from routers import free_endpoint

@@ -10,9 +10,9 @@ from optipmb_schemas import encode, encoding_of
 from optipmb_schemas.ros2.cpm import CPM
 from optipmb_schemas.ros2.tracks import TRACKED, header_of
 from optipmb_schemas.ros2.types import own_types
+from optipmb_service.app.configuration import load
 from optipmb_service.edges.ros2.graph import NO_HASH, Endpoint, Node, TopicKey
 from optipmb_service.edges.ros2.work import QUEUE, TF, Work
-from optipmb_service.settings import load
 from structlog.testing import capture_logs
 from tracks_message import tracks_message
 

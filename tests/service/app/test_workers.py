@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 from optipmb_service.app import workers
+from optipmb_service.app.configuration import load
 from optipmb_service.app.lifecycle import EndBound, StopRequest
 from optipmb_service.app.workers import Supervisor, Worker, serve_workers
-from optipmb_service.settings import load
 from optipmb_service.telemetry.health import ProcessHealth
 from optipmb_service.telemetry.metrics import Metrics
 from structlog.testing import capture_logs

@@ -17,10 +17,10 @@ from log_process import LogProcess
 from nats_process import started
 from optipmb_client import Connection, kept_tracks
 from optipmb_service.app.cli import nats_server
+from optipmb_service.app.configuration import SettingsInvalidError, load
 from optipmb_service.cluster.jetstream import JetStream
 from optipmb_service.cluster.nats_connection import access
 from optipmb_service.cluster.store import StoreError
-from optipmb_service.settings import SettingsInvalidError, load
 from protected import MAKE, make
 from router import Node, Sensor, until
 from routers import free_endpoint, open_router

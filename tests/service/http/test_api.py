@@ -22,11 +22,12 @@ from optipmb_schemas import (
     SessionSummary,
 )
 from optipmb_schemas.json_form import event_json, problem_json, tracks_json, zones_json
+from optipmb_service.app.configuration import SettingsInvalidError, load
 from optipmb_service.edges import access
 from optipmb_service.edges.access import Caller, NotAllowedError
 from optipmb_service.edges.http import application, server
 from optipmb_service.edges.readers import BURST, Bounds, Feeds, Publication, Reader, Wish
-from optipmb_service.settings import Settings, SettingsInvalidError, load
+from optipmb_service.settings import Settings
 from readers import received, texts
 from router import until
 from watched import (

@@ -20,11 +20,12 @@ import numpy as np
 import pytest
 from json_senders import Edge, damaged, document, exists, post
 from optipmb_schemas import Attribute, MessageError, encode_json
+from optipmb_service.app.configuration import load
 from optipmb_service.edges import access, inputs
 from optipmb_service.edges.http import detections
 from optipmb_service.edges.inputs import Inputs
 from optipmb_service.edges.json_frames import MOST_SEPARATE, FrameReader, separate
-from optipmb_service.settings import InputSettings, Settings, load
+from optipmb_service.settings import InputSettings, Settings
 from optipmb_service.telemetry import problem_reporter
 from optipmb_service.zenoh.client import Client
 from router import Node, Sensor, plain, until

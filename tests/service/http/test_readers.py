@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 from optipmb_client.merging import MOST_STREAMS
-from optipmb_service.edges.readers import Outbox, Pace
+from optipmb_service.edges.queues import Outbox, Pace
 
 
 async def test_a_reader_is_cancelled_also_as_an_item_comes() -> None:

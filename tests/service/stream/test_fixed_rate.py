@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from fusing import FRONT, FUSED, REAR
 from optipmb_schemas import Detections, Problem, Tracks, decode
+from optipmb_service.app.configuration import load
 from optipmb_service.session.checkpoint import encode_checkpoint
-from optipmb_service.settings import load
 from optipmb_service.streams import outbox, parts, sensor_meters, sources, stream
 from optipmb_service.streams.profiles import Profiles
 from optipmb_service.streams.stream import Stream

@@ -13,11 +13,11 @@ import optipmb_service.streams.directory
 import pytest
 from fusing import FRONT, FUSED, REAR, drive
 from optipmb_schemas import Detections, Keys, SessionParameters, SessionState, Tracks, decode
+from optipmb_service.app.configuration import SettingsInvalidError, load
 from optipmb_service.cluster.leases import partition_of
 from optipmb_service.session.checkpoint import digest_of
 from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.settings import SettingsInvalidError, load
 from optipmb_service.streams.profiles import Fusion
 from optipmb_service.units import SECOND
 from router import Node, Sensor, until

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from optipmb_schemas import Problem
+from optipmb_service.app.configuration import SettingsInvalidError, load
 from optipmb_service.session.pending import CloudBuffer
 from optipmb_service.session.problems import problem_of
-from optipmb_service.settings import SettingsInvalidError, load
 from optipmb_service.streams.profiles import Profiles
 from optipmb_service.telemetry.problem_reporter import LOGGED_PER_SECOND, PUBLISHED_PER_SECOND, ProblemReporter
 from optipmb_service.telemetry.stream_meter import StreamMeter

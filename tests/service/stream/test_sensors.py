@@ -8,10 +8,10 @@ import optipmb_schemas as schemas
 import pytest
 from fusing import FRONT, FUSED, REAR, SIDE, drive
 from optipmb_schemas import Detections, Keys, SessionParameters, SessionState
+from optipmb_service.app.configuration import load, missing_files
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.settings import load, missing_files
 from optipmb_service.streams.profiles import Profiles
 from optipmb_tools.run import dumps as client
 from router import Node, until

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from optipmb_client.merging import FinalEvents
 from optipmb_schemas import Events, Problem, decode
+from optipmb_service.app.configuration import SettingsInvalidError, load
 from optipmb_service.session.checkpoint import decode_checkpoint, encode_checkpoint, state_bytes
 from optipmb_service.session.outputs import Output, TrackedFrame
 from optipmb_service.session.policy import Policy
 from optipmb_service.session.session import Session
-from optipmb_service.settings import SettingsInvalidError, SiteSettings, ZoneSettings, load
+from optipmb_service.settings import SiteSettings, ZoneSettings
 from optipmb_service.streams.profiles import Profiles
 from optipmb_service.streams.streams import Streams
 from registries import Around, packet_of, streams_of

@@ -10,7 +10,7 @@ import zenoh
 from optipmb_client.zenoh.handles import Sender
 from optipmb_client.zenoh.session import ZenohSession
 from optipmb_schemas import Keys, Tracks, encoding_of
-from optipmb_service.settings import load
+from optipmb_service.app.configuration import load
 from optipmb_service.zenoh.client import Client
 from router import until
 from routers import free_endpoint, open_client, open_router

@@ -33,10 +33,10 @@ from optipmb_schemas import (
     encode_json,
     encoding_of,
 )
+from optipmb_service.app.configuration import load
 from optipmb_service.app.workers import QUERIES
 from optipmb_service.session.outputs import TrackedFrame
 from optipmb_service.session.session import Session
-from optipmb_service.settings import load
 from optipmb_service.zenoh.transport import Transport
 from router import Node, Sensor, plain, until
 from routers import free_endpoint, open_router

@@ -13,7 +13,7 @@ import pytest
 from optipmb_client.zenoh.handles import ItemQueue
 from optipmb_client.zenoh.session import ZenohSession
 from optipmb_schemas import Keys
-from optipmb_service.settings import load
+from optipmb_service.app.configuration import load
 from optipmb_service.zenoh.topics import Topic
 from optipmb_service.zenoh.transport import Transport
 from router import until

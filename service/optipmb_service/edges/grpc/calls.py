@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from optipmb_service.edges.access import Caller
     from optipmb_service.edges.grpc.server import GrpcServer
-    from optipmb_service.edges.readers import Outbox
+    from optipmb_service.edges.queues import Outbox
 
     P = TypeVar("P", bound=ProtoMessage)
 

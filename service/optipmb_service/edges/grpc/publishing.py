@@ -15,7 +15,7 @@ from optipmb_schemas.protobuf.convert import EncodedTracks
 from optipmb_service.edges.grpc.network import Listener, problem_response, tracks_response
 from optipmb_service.edges.grpc.selection import check_bound
 from optipmb_service.edges.inputs import CACHE, WINDOW, InFlight, put
-from optipmb_service.edges.readers import Outbox
+from optipmb_service.edges.queues import Outbox
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Callable, Iterable

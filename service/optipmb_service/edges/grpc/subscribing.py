@@ -14,7 +14,8 @@ from optipmb_schemas.protobuf import tracking_pb2 as pb
 from optipmb_service.edges.grpc.calls import EndCall
 from optipmb_service.edges.grpc.network import Listener, tracks_response
 from optipmb_service.edges.grpc.selection import EventSelection, Filter
-from optipmb_service.edges.readers import Outbox, Pace, listed
+from optipmb_service.edges.queues import Outbox, Pace
+from optipmb_service.edges.readers import listed
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator, Iterable

@@ -20,7 +20,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from optipmb_service.edges.http.api import parameters_of
-from optipmb_service.edges.readers import Outbox, Publication
+from optipmb_service.edges.queues import Outbox
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from starlette.requests import Request
 
     from optipmb_service.edges.http.api import Readers
-    from optipmb_service.edges.readers import EventLog, Logs
+    from optipmb_service.edges.readers import EventLog, Logs, Publication
     from optipmb_service.settings import Settings
     from optipmb_service.telemetry.health import ProcessHealth
 
