@@ -201,3 +201,12 @@ def remove_unfinished(folder: Path, names: Iterable[str]) -> None:
     for entry in folder.glob(".*"):
         if entry.name[1:].rpartition(".")[0].rpartition(".")[0] in stems:
             entry.unlink(missing_ok=True)
+
+
+def is_number(text: str) -> bool:
+    """Tell whether a text is a number, which for Python also 1_000 is."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return "_" not in text

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
-from optipmb_tools.table_files import BOX_LISTS
+from optipmb_tools.box_records import BOX_LISTS
 
 
 @dataclass(frozen=True)

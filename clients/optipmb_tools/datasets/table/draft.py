@@ -13,9 +13,9 @@ from optipmb_tools.datasets.motion import Moves
 from optipmb_tools.datasets.table.columns import FACTORS, TableColumn, candidates
 from optipmb_tools.datasets.table.findings import Reading
 from optipmb_tools.datasets.table.pixels import Placed
-from optipmb_tools.files import DatasetError
+from optipmb_tools.files import DatasetError, is_number
 from optipmb_tools.geometry import Bools, Floats, Ints
-from optipmb_tools.table_files import NO_VALUE, Columns, is_number
+from optipmb_tools.table_files import NO_VALUE, Columns
 
 if TYPE_CHECKING:
     from optipmb import GroundCamera

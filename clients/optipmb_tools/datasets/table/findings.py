@@ -13,8 +13,8 @@ import numpy as np
 
 from optipmb_tools.datasets.evidence import Evidence
 from optipmb_tools.datasets.interface import Assumption
-from optipmb_tools.files import DatasetError
-from optipmb_tools.table_files import is_number, line_of
+from optipmb_tools.files import DatasetError, is_number
+from optipmb_tools.table_files import line_of
 
 NOISE: Final = 0.1  # difference of two shares that tells nothing
 HALF: Final = 0.5  # share of its rival's evidence up to which a reading is refused

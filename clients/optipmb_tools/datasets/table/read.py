@@ -7,12 +7,13 @@ from typing import Final
 
 import numpy as np
 
+from optipmb_tools.box_records import frame_numbers
 from optipmb_tools.datasets.table import frames, headings, kept, names, places, poses, roles, scores, sizes, times
 from optipmb_tools.datasets.table.columns import TableColumn
 from optipmb_tools.datasets.table.draft import Draft, TableRows
 from optipmb_tools.datasets.table.findings import Reading
 from optipmb_tools.files import DatasetError
-from optipmb_tools.table_files import Columns, frame_numbers, read_table
+from optipmb_tools.table_files import Columns, read_table
 
 STEPS: Final = (
     *(roles.step, names.keys, times.step, names.step, places.step, sizes.step, headings.step, scores.step, kept.step),

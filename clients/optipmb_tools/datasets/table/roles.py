@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from optipmb_tools.box_records import frame_numbers
 from optipmb_tools.datasets.table.angles import LARGEST_DEGREES
 from optipmb_tools.datasets.table.columns import (
     ALIASES,
@@ -23,7 +24,8 @@ from optipmb_tools.datasets.table.corners import with_boxes
 from optipmb_tools.datasets.table.draft import Draft
 from optipmb_tools.datasets.table.findings import Reading, Understood
 from optipmb_tools.datasets.table.pixels import METRES
-from optipmb_tools.table_files import NO_VALUE, Columns, frame_numbers, is_number, unique_texts
+from optipmb_tools.files import is_number
+from optipmb_tools.table_files import NO_VALUE, Columns, unique_texts
 
 _MOST_SHOWN: Final = 6
 _NO_COLUMN: Final = TableColumn("", None, "")

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from optipmb_tools.datasets.table.columns import UNITS, TableColumn
 from optipmb_tools.datasets.table.draft import Draft, Stamps, missing, numbers
 from optipmb_tools.datasets.table.findings import HALF, Claim, Reading
+from optipmb_tools.files import is_number
 from optipmb_tools.geometry import Bools, Ints
-from optipmb_tools.table_files import NO_VALUE, is_number
+from optipmb_tools.table_files import NO_VALUE
 
 SECONDS: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _WORDS: Final = {"s": "seconds", "ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
