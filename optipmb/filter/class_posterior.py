@@ -57,7 +57,7 @@ UNGROUPED: Final = np.zeros((0, 0))
 
 @kernel
 def predict_classes(
-    kept: Index, label: Index, posterior: Array, memory: Array, confusion: Array, classes: Classes
+    kept: Index, label: Index, posterior: Array, periods: float, confusion: Array, classes: Classes
 ) -> Array:
     """Return pi_+ (K, C) of the objects that stay.
 
@@ -67,7 +67,7 @@ def predict_classes(
     Arguments of its own:
         kept: (K,) objects that stay.
         posterior: (N, C) pi, (0, 0) where the density has none.
-        memory: (C,) lambda^(dt/T).
+        periods: dt/T.
         confusion: Lambda; of (0, 0) the result has no columns.
 
     Raises:
@@ -79,6 +79,8 @@ def predict_classes(
     out = np.zeros((kept.shape[0], count))
     for k in range(kept.shape[0] if count else 0):
         n, total = kept[k], 0.0
+        own = classes[label[n]]
+        kept_part, size = own.class_memory**periods, own.group_size
         for c in range(count):
             likely = confusion[c, label[n]]
             if likely > 0.0:
@@ -92,7 +94,6 @@ def predict_classes(
             total = 1.0
         for c in range(count):
             if confusion[c, label[n]] > 0.0:
-                kept_part, size = memory[label[n]], classes[label[n]].group_size
                 out[k, c] = kept_part * (out[k, c] / total) + (1.0 - kept_part) / size
     return out
 

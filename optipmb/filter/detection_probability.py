@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from optipmb.model.density import Density, Moment
     from optipmb.model.frame import PointCloud
     from optipmb.model.rows import Array, Index
-    from optipmb.model.table import ClassTable
+    from optipmb.model.table import Classes, ClassTable
 
     Coordinates = NDArray[np.float32]
     Small = NDArray[np.uint32]
@@ -50,7 +50,7 @@ def detection_probability(
     share = moment.dt / table.detection_time if table.detection_time > 0.0 else 1.0
     p_d: Array
     if cloud is None and looks is None:
-        p_d = of_rows(np.ascontiguousarray(over_time(table["detection"], share)), objects.words, components.words)
+        p_d = usual_probability(objects.words, components.words, share, table.classes)
         return p_d
     label = np.concatenate((objects.label, components.label))
     p_d = table["detection"][label]
@@ -68,45 +68,46 @@ def detection_probability(
         s_d = table["detection_floor"][label]
         share_seen = np.minimum(1.0, (1.0 - s_d) * points / table["expected_points"][label] + s_d)
         p_d *= np.where(known, share_seen, 1.0)
-    if looks is None:
-        return over_time(p_d, share)
     shares = np.full(len(p_d), share)
-    shares[: len(objects)] = looks.time / table.detection_time if table.detection_time > 0.0 else 1.0
-    return over_time(p_d * np.concatenate((looks.in_view, looks.poisson_in_view)), shares)
+    if looks is not None:
+        p_d *= np.concatenate((looks.in_view, looks.poisson_in_view))
+        shares[: len(objects)] = looks.time / table.detection_time if table.detection_time > 0.0 else 1.0
+    hold(p_d, shares)
+    return p_d
 
 
 @kernel
-def of_rows(value: Array, object_words: Array, component_words: Array) -> Array:
-    """Return the value of the class, of (C,), for each object and, behind them, each component, (N + J,)."""
+def usual_probability(object_words: Array, component_words: Array, share: float, classes: Classes) -> Array:
+    """Return p_d0 over a share of its time for each object and, behind them, each component, (N + J,)."""
+    usual = np.empty(len(classes))
+    for c in range(len(classes)):
+        usual[c] = over_time(classes[c].detection, share)
     first, second = objects_in(object_words).label, components_in(component_words).label
     out = np.empty(first.shape[0] + second.shape[0])
     for n in range(first.shape[0]):
-        out[n] = value[first[n]]
+        out[n] = usual[first[n]]
     for j in range(second.shape[0]):
-        out[first.shape[0] + j] = value[second[j]]
+        out[first.shape[0] + j] = usual[second[j]]
     return out
 
 
-def over_time(p_d: Array, share: float | Array) -> Array:
+@kernel
+def hold(p_d: Array, share: Array) -> None:
+    """Replace probabilities (N,) by those of `over_time`, each over its share."""
+    for n in range(p_d.shape[0]):
+        p_d[n] = over_time(p_d[n], share[n])
+
+
+@kernel
+def over_time(p_d: float, share: float) -> float:
     """Return the probability of a detection within a share of the time that p_d holds for, ``1 - (1 - p_d)^share``.
 
     A detector that looks twice as often does not see twice as much: what hides an object hides it in the next look as
     well. So p_d holds for `detection_time`, and a miss weighs by the time that it lasts. Looks farther apart are
     independent: the share is at most one. It is at least `LEAST_SHARE`, so that frames of equal stamps can
     be associated.
-
-    Args:
-        p_d: (N,) probabilities.
-        share: of that time, one for all or (N,).
     """
-    kept: Array
-    if isinstance(share, np.ndarray):
-        kept = np.where(share >= 1.0, p_d, 1.0 - (1.0 - p_d) ** np.maximum(share, LEAST_SHARE))
-    elif share >= 1.0:
-        kept = p_d
-    else:
-        kept = 1.0 - (1.0 - p_d) ** max(share, LEAST_SHARE)
-    return kept
+    return p_d if share >= 1.0 else 1.0 - (1.0 - p_d) ** max(share, LEAST_SHARE)
 
 
 CELLS: Final = 128

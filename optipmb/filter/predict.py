@@ -341,8 +341,6 @@ def centred(points: Array, s: int) -> float:
     return shift
 
 
-NO_MEMORY: Final = np.zeros(0)
-"""In place of the memory of the classes of a group where the profile has no groups."""
 LONGEST_STEP_S: Final = 6.0
 """Longest time between two frames, s, over which an object is followed although its class forgets it sooner."""
 
@@ -364,13 +362,10 @@ def predict(density: Density, moment: Moment, table: ClassTable) -> tuple[Densit
         DensityError: the parts of the density do not fit together, or a label is of no class.
     """
     misses, pi = density.misses, density.class_probability
-    grouped = len(table.confusion) > 0
-    times = moment.dt / table.period if moment.before_ns != NO_FRAME else 0.0
-    memory = table["class_memory"] ** times if grouped else NO_MEMORY
     given = density.bernoulli.words, density.missed_from_ns, UNGROUPED if pi is None else pi, density.poisson.words
     try:
         kept, objects, likely, components, repaired = predict_density(
-            *given, tuple(moment), (memory, table.confusion), table.classes
+            *given, tuple(moment), table.confusion, table.classes
         )
     except ValueError as error:
         check_fitting(density, density.labels)  # names the column
@@ -378,7 +373,7 @@ def predict(density: Density, moment: Moment, table: ClassTable) -> tuple[Densit
     if misses is not None and kept.shape[0] < len(misses):
         misses = misses.take(kept)
     parts = Bernoullis.of(objects), Poissons.of(components)
-    pi = likely if grouped else None
+    pi = likely if len(table.confusion) else None
     return Density(moment.stamp_ns, density.next_id, *parts, density.labels, misses, pi), repaired
 
 
@@ -389,12 +384,12 @@ def predict_density(
     class_probability: Array,
     component_words: Array,
     moment: Columns,
-    grouped: tuple[Array, Array],
+    confusion: Array,
     classes: Classes,
 ) -> tuple[Index, Array, Array, Array, int]:
     """Predict the objects and components that are within the limit of their class (eq. PPP_prediction, MB_prediction).
 
-    `class_probability`, and `grouped` with memory and confusion, are those of `predict_classes`.
+    `class_probability` and `confusion` are those of `predict_classes`.
 
     Returns:
         The (K,) objects that stay, the array of the predicted objects, pi_+, the array of the predicted components, and
@@ -411,11 +406,11 @@ def predict_density(
         raise ValueError("misses of other objects")
     if now.before_ns == NO_FRAME or now.dt == 0.0:
         every = np.arange(label.shape[0])
-        pi = predict_classes(every, label, class_probability, *grouped, classes)
+        pi = predict_classes(every, label, class_probability, 0.0, confusion, classes)
         return every, object_words, pi, component_words, 0
-    survival = np.empty(len(classes))
+    survival, periods = np.empty(len(classes)), now.dt / now.period
     for c in range(len(classes)):
-        survival[c] = classes[c].survival ** (now.dt / now.period)
+        survival[c] = classes[c].survival ** periods
 
     old = objects_in(object_words)
     seen_from_ns = now.before_ns if now.dt <= LONGEST_STEP_S else now.stamp_ns
@@ -432,7 +427,7 @@ def predict_density(
         new.hits[k], new.looks[k] = old.hits[n], old.looks[n]
         new.extracted[k], new.confirmed[k] = old.extracted[n], old.confirmed[n]
 
-    pi = predict_classes(kept, old.label, class_probability, *grouped, classes)
+    pi = predict_classes(kept, old.label, class_probability, periods, confusion, classes)
     undetected = components_in(component_words)
     chosen = rows_within(undetected.label, undetected.born_ns, now.before_ns, True, now, classes)
     carried = np.empty(chosen.shape[0] * COMPONENT)

@@ -61,7 +61,7 @@ from optipmb.compiled import kernel
 from optipmb.filter.calibration import log_odds
 from optipmb.filter.hypotheses import DEVIATIONS_2
 from optipmb.filter.predict import rows_within
-from optipmb.filter.undetected import AGED, MARKED
+from optipmb.filter.undetected import AGED
 from optipmb.model.density import (
     BINS,
     COUNTS,
@@ -322,8 +322,7 @@ def learn(
     counts: tuple[Array, Slots, Index],
     before_words: Array,
     after: tuple[Array, Index, NDArray[np.bool_]],
-    components_label: Index,
-    fate: Index,
+    components: tuple[Index, Index, int],
     detections: tuple[Array, Array, Index, Index],
     dt: float,
 ) -> tuple[Array, Slots, Index]:
@@ -334,15 +333,15 @@ def learn(
         before_words: array of the `Bernoullis` of the frame before.
         after: array of the posterior, and for each object its measurement, negative where missed, and whether it was in
             view, (K,).
-        components_label: (J,) classes of the predicted components.
-        fate: (J + M,) of `update_undetected`.
+        components: classes of the predicted components, (J,); `fate` of `update_undetected`, (J + M,); and how many
+            stay, none without RPP.
         detections: scores, calibrated scores and classes of the detections, (D,), and the detection of each
             measurement, (M,).
     """
     classes, slots, bins = counts
     words, hit, looked = after
     before, objects = objects_in(before_words), objects_in(words)
-    score, meant, label, rows = detections
+    (components_label, fate, staying), (score, meant, label, rows) = components, detections
     for d in range(score.shape[0]):
         classes[label[d], GIVEN, bin_of(score[d])] += 1.0
     used, share = np.zeros(rows.shape[0], np.bool_), min(FULL_SLOT * dt, 1.0)
@@ -378,19 +377,16 @@ def learn(
             objects.score[k] *= score[d] / meant[d]
 
     # Components, and detections that no object uses
-    kept = 0
-    for j in range(fate.shape[0]):
-        kept = max(kept, fate[j] + 1)
-    bins_after, components = np.full(kept, NO_BIN), fate.shape[0] - rows.shape[0]
+    bins_after, predicted = np.full(staying, NO_BIN), fate.shape[0] - rows.shape[0]
     for j in range(bins.shape[0]):
         b = min(bins[j], BINS - 1)
-        if fate[j] >= 0:
+        if 0 <= fate[j] < staying:
             bins_after[fate[j]] = b
         elif fate[j] == AGED and b >= 0:
             classes[components_label[j], DETECTIONS, b] += share
     for m in range(rows.shape[0]):
-        d, j = rows[m], fate[components + m]
-        if j >= 0:
+        d, j = rows[m], fate[predicted + m]
+        if 0 <= j < staying:
             bins_after[j] = bin_of(score[d])
         elif not used[m]:
             classes[label[d], DETECTIONS, bin_of(score[d])] += share
@@ -530,8 +526,8 @@ def learn_scatter(
 @kernel
 def learn_frame(
     counts: tuple[Array, Slots, Index, tuple[Array, Array], Array],
-    prior: tuple[Array, Array, Array],
-    posterior: tuple[Array, Index, Index, Index, Index],
+    prior: tuple[Array, Array, Array, Array],
+    posterior: tuple[Array, Index, Index, Index, Index, int],
     detections: tuple[Array, Array, Index, Index],
     position: Array,
     moment: Columns,
@@ -541,17 +537,21 @@ def learn_frame(
 
     Arguments of its own:
         counts: the arrays before it; `sums` and `innovations` last.
-        prior: arrays of the objects of the frame before, and of the predicted objects and components.
-        posterior: array of the objects; `row`, `measurement` and `fate` of `Update`; and `Misses.looked_ns`, (0,) where
-            every frame looks at all objects.
+        prior: arrays of the objects and components of the frame before, and of the predicted ones.
+        posterior: array of the objects; `row`, `measurement` and `fate` of `Update`; `Misses.looked_ns`, (0,) where
+            every frame looks at all objects; and the number of components.
     """
     classes, slots, bins, sums, innovations = counts
-    (words, row, hit, fate, looked_ns), now = posterior, Moment(*moment)
+    before_words, components_before, prior_words, components = prior
+    (words, row, hit, fate, looked_ns, staying), now = posterior, Moment(*moment)
     looked = looked_ns == now.stamp_ns if looked_ns.shape[0] else np.ones(hit.shape[0], np.bool_)
-    given, label = (classes.copy(), slots, bins), components_in(prior[2]).label
-    found = learn(given, prior[0], (words, hit, looked), label, fate, detections, now.dt)
+    waiting, label = components_in(components_before), components_in(components).label
+    if label.shape[0] < bins.shape[0]:
+        bins = bins[rows_within(waiting.label, waiting.born_ns, now.before_ns, True, now, table)]
+    given, known = (classes.copy(), slots, bins), (label, fate, staying)
+    found = learn(given, before_words, (words, hit, looked), known, detections, now.dt)
     stamps = now.stamp_ns, now.before_ns
-    three = prior[0], prior[1], words
+    three = before_words, prior_words, words
     scatter, lagged, kept = learn_scatter(sums, innovations, three, (row, hit), position, stamps, table)
     return (*found, scatter, lagged, kept)
 
@@ -600,17 +600,12 @@ def followed(
         poisson, misses: of the posterior.
         rows: (M,) detection of each measurement.
     """
-    density, fate, looked_ns = scores.before, update.fate, FROM_LAST_DETECTION if misses is None else misses.looked_ns
-    own, before = SelfCalibration.of(density), density.poisson
-    bins = own.components
-    if len(prior.poisson) < len(bins):
-        bins = bins[rows_within(before.label, before.born_ns, density.stamp_ns, True, moment, table.classes)]
-    if not len(poisson):  # perhaps without RPP
-        fate = np.where(fate >= 0, MARKED, fate)
+    density, looked_ns = scores.before, FROM_LAST_DETECTION if misses is None else misses.looked_ns
+    own = SelfCalibration.of(density)
     classes, objects, components, scatter, lagged, innovations = learn_frame(
-        (own.classes, own.objects, bins, (own.scatter, own.lagged), own.innovations),
-        (density.bernoulli.words, prior.bernoulli.words, prior.poisson.words),
-        (update.objects, update.row, update.measurement, fate, looked_ns),
+        (own.classes, own.objects, own.components, (own.scatter, own.lagged), own.innovations),
+        (density.bernoulli.words, density.poisson.words, prior.bernoulli.words, prior.poisson.words),
+        (update.objects, update.row, update.measurement, update.fate, looked_ns, len(poisson)),
         (scores.given, scores.meant, scores.label, rows),
         measurements.position,
         tuple(moment),

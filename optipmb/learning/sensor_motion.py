@@ -474,22 +474,25 @@ def common_motion(pairs: Pairs, guess: Array, reach: float, turn: float, trust: 
     low = -0.5 * CELL * side
     angles = min(MOST_ANGLES, math.ceil(turn / ANGLE))
     near = within(pairs, guess, 0.5 * CELL * side, angles * ANGLE)
-    votes, voters = np.zeros((side + 2, side + 2), np.int64), np.empty((near.shape[0], 2), np.int64)
+    votes, cells = np.zeros((side + 2, side + 2), np.int64), np.empty((near.shape[0], 2), np.int64)
     for a in range(-angles, angles + 1):
         theta = guess[2] + a * ANGLE
         cos, sin = math.cos(theta), math.sin(theta)
-        count = 0
+        count, last, x, y = 0, -1, 0.0, 0.0
         for k in range(near.shape[0]):
             n, m = near[k, 0], near[k, 1]
-            x = cos * start[n, 0] - sin * start[n, 1] + guess[0]
-            y = sin * start[n, 0] + cos * start[n, 1] + guess[1]
+            if n != last:
+                x = cos * start[n, 0] - sin * start[n, 1] + guess[0]
+                y = sin * start[n, 0] + cos * start[n, 1] + guess[1]
+                last = n
             i, j = math.floor((target[m, 0] - x - low) / CELL), math.floor((target[m, 1] - y - low) / CELL)
             if 0 <= i < side and 0 <= j < side:
+                if votes[i + 1, j + 1] == 0:
+                    cells[count, 0], cells[count, 1] = i, j
+                    count += 1
                 votes[i + 1, j + 1] += 1
-                voters[count, 0], voters[count, 1] = i, j
-                count += 1
         for k in range(4 * count):  # squares of four cells, which meet in a corner of the cell of a pair
-            i, j = voters[k // 4, 0] + k % 2, voters[k // 4, 1] + k // 2 % 2
+            i, j = cells[k // 4, 0] + k % 2, cells[k // 4, 1] + k // 2 % 2
             found = votes[i, j] + votes[i + 1, j] + votes[i, j + 1] + votes[i + 1, j + 1]
             if found < votes_best:
                 continue
@@ -499,7 +502,7 @@ def common_motion(pairs: Pairs, guess: Array, reach: float, turn: float, trust: 
                 votes_best, far_best = found, far
                 motion[0], motion[1], motion[2] = guess[0] + dx, guess[1] + dy, theta
         for k in range(count):
-            votes[voters[k, 0] + 1, voters[k, 1] + 1] = 0
+            votes[cells[k, 0] + 1, cells[k, 1] + 1] = 0
     for limit in (2.0 * CELL, 1.5 * CELL, NEAR, NEAR, NEAR):
         _refine(pairs, limit, guess, trust, motion)
     held = together(pairs, motion)

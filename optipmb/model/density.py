@@ -35,7 +35,7 @@ from optipmb.model.lost_objects import (
     Statistics,
     Tracklets,
 )
-from optipmb.model.rows import Column, Rows, arrays_of, record, shown, views_of
+from optipmb.model.rows import FLOAT, INDEX, Column, Rows, arrays_of, record, shown, views_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -185,6 +185,8 @@ SCATTER: Final = 3
 AXES: Final = 2
 """Shapes of `SelfCalibration`; a slot has looks and ticks of 0.1 ms behind the bins."""
 NO_BIN: Final = -1
+OF_SLOTS: Final = np.dtype(np.uint16)
+"""Type of the counts of slots."""
 
 
 ENOUGH: Final = 3.0
@@ -346,8 +348,8 @@ def fits(density: Density, classes: int) -> bool:
     misses, count, own = density.misses, len(density.bernoulli), density.self_calibration
     if misses is not None and len(misses) != count:
         return False
-    arrays: list[tuple[object, tuple[int, ...], object]]
-    arrays = [(density.class_probability, (count, classes), np.float64), (density.sensor, (5,), np.float64)]
+    arrays: list[tuple[object, tuple[int, ...], np.dtype[Any]]]
+    arrays = [(density.class_probability, (count, classes), FLOAT), (density.sensor, (5,), FLOAT)]
     if own is not None:
         shapes = _shapes(classes, count, len(density.poisson))
         arrays += [(getattr(own, name), *shape_and_kind) for name, shape_and_kind in shapes.items()]
@@ -398,15 +400,15 @@ def _others(density: Density) -> dict[str, NDArray[Any]]:
     return {name: array for name, array in others.items() if array is not None}
 
 
-def _shapes(classes: int, objects: int, components: int) -> dict[str, tuple[tuple[int, ...], Any]]:
+def _shapes(classes: int, objects: int, components: int) -> dict[str, tuple[tuple[int, ...], np.dtype[Any]]]:
     """Return shape and type of the arrays of `SelfCalibration`."""
     return {
-        "classes": ((classes, COUNTS, BINS), np.float64),
-        "objects": ((objects, SLOTS, SLOT), np.uint16),
-        "components": ((components,), np.int64),
-        "scatter": ((classes, SCATTER), np.float64),
-        "innovations": ((objects, AXES), np.float64),
-        "lagged": ((classes, AXES), np.float64),
+        "classes": ((classes, COUNTS, BINS), FLOAT),
+        "objects": ((objects, SLOTS, SLOT), OF_SLOTS),
+        "components": ((components,), INDEX),
+        "scatter": ((classes, SCATTER), FLOAT),
+        "innovations": ((objects, AXES), FLOAT),
+        "lagged": ((classes, AXES), FLOAT),
     }
 
 
@@ -449,10 +451,10 @@ def columns_in(parts: Mapping[str, bytes], classes: int) -> dict[str, NDArray[An
     if SENSOR in parts:
         columns[SENSOR] = _words(parts, SENSOR, 5)
     if f"{COUNTED}.classes" in parts:
-        for name, (shape, kind) in _shapes(0, 0, 0).items():
-            width = prod(shape[1:]) * np.dtype(kind).itemsize // 8
+        for name, (shape, number) in _shapes(0, 0, 0).items():
+            width = prod(shape[1:]) * number.itemsize // 8
             words = _words(parts, f"{COUNTED}.{name}", width)
-            columns[f"{COUNTED}.{name}"] = words.view(kind).reshape(-1, *shape[1:])
+            columns[f"{COUNTED}.{name}"] = words.view(number).reshape(-1, *shape[1:])
     if f"{APPEARANCE}.model" in parts:
         numbers = int(_words(parts, f"{APPEARANCE}.model", 2).view(np.int64)[1:].sum())
         if not EMBEDDING[0] <= numbers <= EMBEDDING[1]:
@@ -611,15 +613,17 @@ def _appearance(columns: Mapping[str, Any], stamp_ns: int, live: int, lost: int,
     return Appearance(**arrays)
 
 
-def _self_calibration(columns: Mapping[str, Any], shapes: Mapping[str, tuple[tuple[int, ...], Any]]) -> SelfCalibration:
+def _self_calibration(
+    columns: Mapping[str, Any], shapes: Mapping[str, tuple[tuple[int, ...], np.dtype[Any]]]
+) -> SelfCalibration:
     """Return the counts of scores, none of which is negative or above `MOST_COUNTED`, and the innovations within it."""
     found = {}
     for name, (shape, kind) in shapes.items():
         column, path = columns.get(f"{COUNTED}.{name}"), f"{COUNTED}.{name}"
         if not isinstance(column, np.ndarray) or column.dtype != kind or column.shape != shape:
-            raise DensityError(path, f"{shape} {kind.__name__}", shown(column))
+            raise DensityError(path, f"{shape} {kind.name}", shown(column))
         low: float
-        low, high = (NO_BIN, BINS - 1) if kind is np.int64 else (0.0, MOST_COUNTED)
+        low, high = (NO_BIN, BINS - 1) if kind == INDEX else (0.0, MOST_COUNTED)
         if name in {"innovations", "lagged"}:
             low = -MOST_COUNTED
         if column.size and not low <= column.min() <= column.max() <= high:

@@ -236,7 +236,8 @@ def test_frames_are_counted_as_plain_python_counts(seed: int) -> None:
         meant, given = rng.uniform(0.1, 1.0, len(score)), (state, before, announced)
         old, new = objects_of(known, mean_before), objects_of(now, mean)
         after, detections = (new.words, hit, looked), (score, meant, label, rows)
-        state, before, kept = learn(given, old.words, after, announced_label, fate, detections, dt)
+        components = announced_label, fate, int((fate >= 0).sum())
+        state, before, kept = learn(given, old.words, after, components, detections, dt)
         np.testing.assert_allclose(new.score, np.where(hit < 0, 1.0, (score / meant)[rows[hit]]), rtol=1e-15)
         announced = np.r_[announced[of_old >= 0], own_bin[rows[of_new >= 0]]]
         announced_label = np.r_[announced_label[of_old >= 0], label[rows[of_new >= 0]]]
