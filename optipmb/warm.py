@@ -21,6 +21,7 @@ from optipmb.joining.evidence import pair_scores
 from optipmb.joining.matching import match
 from optipmb.joining.places import with_declared
 from optipmb.learning.hindsight import later_velocities
+from optipmb.learning.self_calibration import learned_noise
 from optipmb.model.errors import EffortError
 from optipmb.model.frame import FieldOfView, PointCloud, Pose, make_frame
 from optipmb.model.parameters import Parameters, load_profile, parse_parameters
@@ -123,6 +124,7 @@ def _run() -> Parameters:
         posterior = result.density
         sound(result.tracks)
     predict_tracks(result.tracks, [0.5], parameters)
+    learned_noise(posterior)
     points: dict[str, Any] = {"label": [0], "center": [[0.2, 0.0, np.nan]], "score": [0.9]}
     point, _ = make_frame(parameters, stamp_ns=5 * 500_000_000, labels=("pedestrian",), **points)
     tracker.step(posterior, point)

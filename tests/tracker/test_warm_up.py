@@ -32,6 +32,7 @@ from dataclasses import replace
 sys.path.insert(0, sys.argv[1])
 import numpy as np
 import optipmb
+from optipmb.learning.self_calibration import learned_noise
 from optipmb.warm import compilations, kernels
 from optipmb.world.zones import Zone, ZoneState, observe
 from scenes import Options, random_parameters, scene
@@ -66,6 +67,10 @@ for seed, modules in enumerate([optipmb.Modules(), optipmb.Modules(), *baselines
     stored = {name: read_only(column) for name, column in optipmb.columns_of(density).items()}
     density = optipmb.density_of(density.stamp_ns, density.next_id, stored, parameters.labels)
     tracker.step(density, frame)
+generic = optipmb.Tracker("generic")  # which learns while it runs
+box = {"labels": ("car",), "label": [0], "center": [[0.0, 0.0, 0.0]], "score": [0.9]}
+frame, _ = optipmb.make_frame(generic.parameters, stamp_ns=0, **box)
+learned_noise(generic.step(generic.initial(), frame).density)
 grown = [name for name, kernel in kernels().items() if len(kernel.signatures) != known.get(name)]
 print(json.dumps({"compiled": compiled, "later": compilations() - compiled, "grown": grown}))
 """
