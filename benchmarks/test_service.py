@@ -8,24 +8,36 @@ Throughput is in frames per second, when a window of 8 is kept full, as a replay
 
 from __future__ import annotations
 
+import http.client
+import json
 import os
 import time
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING
 
-import numpy as np
+import paho.mqtt.client as paho
 import pytest
+import websocket
+from broker import mosquitto
 from gateway import GatewayProcess
+from json_senders import document
 from load import Load, generated, run_load
 from optipmb_client import Connection, Publisher, Subscriber
+from paho.mqtt.enums import CallbackAPIVersion
 from router import Node, Sensor
+from routers import free_endpoint
 from service_process import ServiceProcess
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
+    from optipmb_schemas import Detections
     from pytest_benchmark.fixture import BenchmarkFixture
+
+    Send = Callable[[Detections], int]
+    """Sends a frame; returns when it was handed over, monotonic, ns."""
 
 OBJECTS = 40
 RATE = 10.0
@@ -34,12 +46,14 @@ WINDOW = 8
 ROUNDS = 5
 ROUND = 100
 SETTLED = 10  # frames that do not count
+TOPIC = "detections"
+HTTP = free_endpoint().removeprefix("tcp/")
 
 
 @pytest.fixture(scope="module")
 def service() -> Iterator[ServiceProcess]:
     """A service in a process of its own."""
-    with ServiceProcess("--instance", "benchmark", "--log-level", "warning") as process:
+    with ServiceProcess("--instance", "benchmark", "--log-level", "warning", "--http", HTTP) as process:
         process.wait_ready()
         yield process
 
@@ -101,37 +115,108 @@ def test_throughput(benchmark: BenchmarkFixture, node: Node) -> None:
     print(figures)  # noqa: T201 - as above
 
 
-@pytest.mark.parametrize("rate", [10, 100])
-def test_gateway(service: ServiceProcess, rate: int) -> None:
-    """Median latency over Zenoh and through a gRPC gateway, and the gateway's processor time per frame."""
-    with GatewayProcess(service.endpoint) as gateway:
-        gateway.wait_ready()
-        zenoh_ms = _latency_ms(service.endpoint, f"gateway/zenoh-{rate}/lidar", rate)
-        began_s = _processor_s(gateway.process.pid)
-        grpc_ms = _latency_ms(f"grpc://{gateway.address}", f"gateway/grpc-{rate}/lidar", rate)
-        used_ms = (_processor_s(gateway.process.pid) - began_s) / round(rate * SECONDS) * 1e3
-    figures = {"rate": rate, "zenoh_ms": zenoh_ms, "grpc_ms": grpc_ms, "gateway_processor_ms": used_ms}
-    print({name: round(value, 2) for name, value in figures.items()})  # noqa: T201 - as above
+@contextmanager
+def put(endpoint: str, stream: str) -> Iterator[Send]:
+    """Send by a publisher of the client: over Zenoh, or gRPC."""
+    with Publisher(stream, endpoint, frame="world") as publisher:
+
+        def send(frame: Detections) -> int:
+            columns = {name: getattr(frame, name) for name in ("center", "size", "yaw", "velocity", "score")}
+            publisher.publish(stamp_ns=frame.stamp_ns, label=["car"] * len(frame.label), **columns)
+            return publisher.last_put_ns
+
+        yield send
 
 
-def _latency_ms(endpoint: str, stream: str, rate: int) -> float:
-    number = np.arange(float(OBJECTS))
-    took_ms = []
-    with Publisher(stream, endpoint, frame="world") as publisher, Subscriber(stream, endpoint) as subscriber:
-        for k in range(round(rate * SECONDS)):
-            publisher.publish(
-                stamp_ns=10**18 + k * 10**9 // rate,
-                label=["car"] * OBJECTS,
-                center=np.column_stack((k / rate + 0 * number, 10 * number, 0 * number)),
-                size=np.tile((4.5, 1.9, 1.6), (OBJECTS, 1)),
-                yaw=0 * number,
-                score=0 * number + 0.9,
+@contextmanager
+def post(address: str, stream: str) -> Iterator[Send]:
+    """Send each frame as a request of one connection."""
+    with closing(http.client.HTTPConnection(address, timeout=60)) as connection:
+
+        def send(frame: Detections) -> int:
+            body, began_ns = json.dumps(document(frame)), time.monotonic_ns()
+            connection.request(
+                "POST", f"/api/v1/detections?stream={stream}", body, {"content-type": "application/json"}
             )
-            received = subscriber.receive(10.0)
-            assert received is not None
-            took_ms.append((received.monotonic_ns - publisher.last_put_ns) / 1e6)
-            time.sleep(max(0.0, 1 / rate - took_ms[-1] / 1e3))
-    return median(took_ms[SETTLED:])
+            assert connection.getresponse().read()
+            return began_ns
+
+        yield send
+
+
+@contextmanager
+def web_socket(address: str, stream: str) -> Iterator[Send]:
+    """Send each frame as a text of one WebSocket."""
+    with closing(websocket.create_connection(f"ws://{address}/api/v1/detections?stream={stream}")) as socket:
+
+        def send(frame: Detections) -> int:
+            body, began_ns = json.dumps(document(frame)), time.monotonic_ns()
+            socket.send(body)
+            assert socket.recv()
+            return began_ns
+
+        yield send
+
+
+@contextmanager
+def mqtt(broker: str) -> Iterator[Send]:
+    """Publish each frame with QoS 1."""
+    client = paho.Client(CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
+    client.connect("127.0.0.1", int(broker.rpartition(":")[2]))
+    client.loop_start()
+
+    def send(frame: Detections) -> int:
+        body, began_ns = json.dumps(document(frame)), time.monotonic_ns()
+        client.publish(TOPIC, body, qos=1).wait_for_publish(60)
+        return began_ns
+
+    try:
+        yield send
+    finally:
+        client.disconnect()
+        client.loop_stop()
+
+
+@pytest.mark.parametrize("interface", ["zenoh", "post", "websocket", "grpc", "mqtt"])
+def test_interface(service: ServiceProcess, interface: str, tmp_path: Path) -> None:
+    """Latency of frames that come by an interface and leave over Zenoh; processor time of a frame in each process."""
+    edge: ServiceProcess | None = None
+    stream = f"interface/{interface}/lidar"
+    with ExitStack() as context:
+        if interface == "grpc":
+            gateway = context.enter_context(GatewayProcess(service.endpoint))
+            edge, sender = gateway, put(f"grpc://{gateway.address}", stream)
+        elif interface == "mqtt":
+            broker = context.enter_context(mosquitto(tmp_path))
+            (tmp_path / "mqtt.toml").write_text(f'[mqtt.inputs."{stream}"]\ntopic = "{TOPIC}"\n')
+            options = ("--settings", str(tmp_path / "mqtt.toml"), "--connect", service.endpoint, "--broker", broker)
+            edge, sender = context.enter_context(ServiceProcess("mqtt", *options, listen=False)), mqtt(broker)
+        elif interface == "zenoh":
+            sender = put(service.endpoint, stream)
+        else:
+            sender = post(HTTP, stream) if interface == "post" else web_socket(HTTP, stream)
+        if edge is not None:
+            edge.wait_ready()
+        send = context.enter_context(sender)
+        subscriber = context.enter_context(Subscriber(stream, service.endpoint))
+        sensor, took_ms = Sensor(stream=stream, objects=OBJECTS), []
+        processes = [service.process.pid, *([] if edge is None else [edge.process.pid])]
+        for seq in range(SETTLED + round(RATE * SECONDS)):
+            if seq == SETTLED:
+                before = [_processor_s(pid) for pid in processes]
+            began_ns = send(sensor.detections(seq))
+            received = subscriber.receive(
+                1.0 if seq < SETTLED else 10.0
+            )  # the broker drops frames before a subscription
+            if received is None:
+                assert seq < SETTLED
+                continue
+            took_ms.append((received.monotonic_ns - began_ns) / 1e6)
+            time.sleep(max(0.0, 1 / RATE - took_ms[-1] / 1e3))
+        after = [_processor_s(pid) for pid in processes]
+    used_ms = [(last - first) / round(RATE * SECONDS) * 1e3 for first, last in zip(before, after, strict=True)]
+    shown = " + ".join(f"{one:.2f}" for one in used_ms)
+    print(f"| {interface} | {median(took_ms[-round(RATE * SECONDS) :]):.1f} | {shown} |")  # noqa: T201 - as above
 
 
 def _processor_s(pid: int) -> float:
