@@ -63,13 +63,14 @@ def read_tables(
         starts = [end - length for end, length in zip(ends, lengths, strict=True)]
         reading.files = tuple((path, start) for path, start, n in zip(members, starts, lengths, strict=True) if n)
         filled = [path for path, length in zip(members, lengths, strict=True) if length] or members[:1]
-        columns = _joined([tables[path] for path in filled])
+        columns = _joined([tables.pop(path) for path in filled])
         found_roles = known[filled[0]] if len(filled) == 1 else roles.find(reading, columns)
         if not columns:
             raise DatasetError(members[0], "a first line with the names of the columns", "no column")
         judged = reading if any(lengths) else replace(reading, findings=[])  # rows that are not there tell nothing
-        draft = Draft(columns, sum(lengths), scored=scored, framed=framed, roles=found_roles)
-        boxes = _boxes(judged, draft)
+        drafts = [Draft(columns, sum(lengths), scored=scored, framed=framed, roles=found_roles)]
+        del columns  # from here on the draft alone has the columns, and frees them
+        boxes = _boxes(judged, drafts.pop())
         if framed:
             return [(reading.path, boxes)]
         found |= {path: boxes.rows(start, end) for path, start, end in zip(members, starts, ends, strict=True)}
