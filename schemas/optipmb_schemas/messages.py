@@ -7,7 +7,7 @@ described here and nowhere else: the JSON Schemas and the tables of the document
 
 import math
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from typing import Annotated, Any, Final, Literal
 
@@ -173,6 +173,16 @@ def attributes_of_rows(attributes: tuple[Attribute, ...] | None, rows: Iterable[
     place = {row: at for at, row in enumerate(rows)}
     chosen = (one for one in attributes or () if one.row in place)
     return tuple(one.model_copy(update={"row": place[one.row]}) for one in chosen) or None
+
+
+def attributes_by_name(found: Mapping[str, tuple[Sequence[str], Reals]], rows: int) -> tuple[Attribute, ...]:
+    """Return the attributes of rows, given by name their texts, "" where unknown, and their scores."""
+    return tuple(
+        Attribute.trusted({"row": row, "name": name, "text": texts[row], "score": float(score[row])})
+        for row in range(rows)
+        for name, (texts, score) in found.items()
+        if texts[row]
+    )
 
 
 class Detections(SensorMessage):

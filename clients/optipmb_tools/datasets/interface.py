@@ -69,14 +69,15 @@ class DetectionFrame:
     field_of_view: FieldOfView | None = None  # in the axes of `pose`; None: everywhere
     position_covariance: Floats | None = None  # (M, 3, 3) along the axes of the sensor, NaN where unknown
     sensor: str = ""  # its name, in a sequence of several
+    attributes: NDArray[np.object_] | None = None  # (M,) texts by name
 
     def __len__(self) -> int:
         return len(self.label)
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Columns with a row for each detection; velocity and position_covariance may be None."""
-        return {name: getattr(self, name) for name in DETECTION_COLUMNS}
+        """Columns with a row for each detection; velocity, position_covariance and attributes may be None."""
+        return {name: getattr(self, name) for name in (*DETECTION_COLUMNS, "attributes")}
 
     def take(self, rows: Ints | Bools) -> "DetectionFrame":
         return replace(self, **{name: values[rows] for name, values in self.columns.items() if values is not None})
@@ -170,6 +171,11 @@ class DataSequence(ABC):
     areas: Sequence[Area] = ()  # later ones lie above earlier ones
     reports: Reports | None = None  # where objects report one by one
     apart: Sequence[str] = ()  # classes whose boxes are things of their own, however close
+
+    @property
+    def attributes(self) -> list[str]:
+        """Names of the texts of its detections."""
+        return sorted({name for one in self.sensors for name in one.attributes})
 
     if TYPE_CHECKING:
 

@@ -6,7 +6,8 @@ frame (its number in the table of detections, or else counted from 0), id, class
 yaw_rate, acceleration, score, existence, confirmed (1 or 0), age, time_since_detection and detection_row: the row of
 the table (from 0; for other data sets the place in the frame) of the detection that the track was given, no value while
 it is missed. A velocity has no value until it is known: from the second detection on, where the detector gives none.
-Where tracks are joined over gaps, object (id of the first track of the object, -1: none) and object_probability follow.
+Where tracks are joined over gaps, object (id of the first track of the object, -1: none) and object_probability follow,
+and where columns of the detections are attributes, the text of each with most evidence, as `attributes.plate`.
 With a georeference lat, lon, alt and heading follow (degrees, m above the ellipsoid, degrees from true north). On
 request the upper triangle of the covariance of (x, y, v, phi, omega, a) follows, `cov_x_x` to `cov_a_a`. Metres,
 seconds, radians; in text with the decimals of `DECIMALS`. The same tracks always give the same bytes.
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from optipmb_schemas import Tracks
+from optipmb_schemas import Tracks, attributes_of_rows
 from optipmb_schemas.json_form import shown
 
 from optipmb_tools.files import remove_unfinished
@@ -124,6 +125,16 @@ def _columns_of(
         columns |= objects.columns(columns["id"], stamps)
     elif joined:
         columns |= {name: stacked(parts, name) for name in ("object", "object_probability")}
+    if sequence is not None and sequence.attributes:
+        starts = itertools.accumulate((len(one.id) for one in parts), initial=0)
+        texts = {
+            (start + known.row, known.name): known.text
+            for start, one in zip(starts, parts, strict=False)
+            for known in one.attributes or ()
+        }
+        for known_as in sequence.attributes:
+            values = [texts.get((row, known_as), "") for row in range(len(frame))]
+            columns[f"attributes.{known_as}"] = np.array(values, np.str_)
     if georeference is not None:
         columns |= georeference.to_geographic(stacked(parts, "center"), columns["yaw"])._asdict()
     if full:
@@ -178,7 +189,9 @@ def taken(tracks: Tracks, rows: NDArray[Any]) -> Tracks:
     """Return rows of the tracks of a message."""
     of_tracks = Tracks.arrays["id"].rows
     columns = {name: getattr(tracks, name) for name, array in Tracks.arrays.items() if array.rows == of_tracks}
-    return tracks.model_copy(update={name: one[rows] for name, one in columns.items() if one is not None})
+    kept = {name: one[rows] for name, one in columns.items() if one is not None}
+    places = np.arange(len(tracks.id))[rows].tolist()
+    return tracks.model_copy(update=kept | {"attributes": attributes_of_rows(tracks.attributes, places)})
 
 
 class TrackCounts(NamedTuple):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 from optipmb_client.errors import ClientError, UsageError
-from optipmb_schemas import Tracks, path_fields, track_fields
+from optipmb_schemas import Tracks, attributes_by_name, path_fields, track_fields
 
 import optipmb
 from optipmb import (
@@ -41,6 +41,7 @@ from optipmb.learning.hindsight import with_hindsight
 from optipmb.learning.self_calibration import learned_noise
 from optipmb.learning.sensor_motion import UNKNOWN_MOTION
 from optipmb.learning.velocity_check import EXPECTED, VelocityCheck
+from optipmb.model.attributes import shown_of
 from optipmb.model.density import STATE, V
 from optipmb.model.parameters import ALIKE
 from optipmb_tools.datasets import DataSequence, Dataset, DatasetArguments, DetectionFrame, selected_frames
@@ -237,6 +238,9 @@ def _message(parameters: Parameters, sequence: DataSequence, frame: DetectionFra
     }
     others = {"class_probability": result.class_probability, "measured": result.measured}
     fields = fields_of(result.tracks, result.paths, **others)
+    if result.density.attributes is not None:
+        texts = shown_of(result.density.attributes, result.tracks.id)
+        fields["attributes"] = attributes_by_name(texts, len(result.tracks.id)) or None
     return Tracks.trusted(header | fields)
 
 

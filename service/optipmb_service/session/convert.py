@@ -164,12 +164,7 @@ def attributes_of(density: optipmb.Density, identity: Sequence[int]) -> tuple[sc
     if density.attributes is None or not len(identity):
         return ()
     found = shown_of(density.attributes, np.array(identity, np.int64))
-    return tuple(
-        schemas.Attribute.trusted({"row": row, "name": name, "text": texts[row], "score": float(share[row])})
-        for row in range(len(identity))
-        for name, (texts, share) in found.items()
-        if texts[row]
-    )
+    return schemas.attributes_by_name(found, len(identity))
 
 
 def tracks_of(result: optipmb.StepResult, stream: str, frame_id: FrameId, **fields: Any) -> TrackedFrame:

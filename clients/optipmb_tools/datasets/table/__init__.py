@@ -41,7 +41,7 @@ from optipmb_tools.table_files import SUFFIXES, Columns, line_of, read_table, ta
 # Options, besides `column.MEANING=NAME` and `class.NAME=NAME`; `tracks` are tables that are yet to be read by them
 OPTIONS: Final = (
     *("time", "rate", "group", "yaw", "heading", "quaternion", "sizes", "axes", "velocity", "score", "invalid"),
-    *("missing", "size_factor", "length_factor"),
+    *("missing", "size_factor", "length_factor", "attributes"),
     *("poses", "truth", "tracks", "decimal", "encoding", "date", "origin", "boxes"),
     *pixels.OPTIONS,
 )
@@ -284,6 +284,12 @@ class TableSequence(DataSequence):
             return [IDENTITY] * len(self)
         return [Pose(row[:3], row[3:]) for row in self._poses]
 
+    @cached_property
+    def attributes(self) -> list[str]:
+        """Names of the texts of its detections."""
+        found = self._boxes.attributes
+        return [] if found is None else sorted({name for texts in found for name in texts})
+
     def rows(self, frame: int) -> Ints:
         """Return the rows of the table, from 0, of the detections (M,) of a frame."""
         return self._boxes.row[self._of(frame)]
@@ -298,7 +304,7 @@ class TableSequence(DataSequence):
             rows = self._of(index)
             stamp_ns = int(self._stamps[index]) - self._origin
             label = self._label[self._start[index] : self._start[index + 1]]
-            known = (name for name in DETECTION_COLUMNS if name != "label" and getattr(boxes, name) is not None)
+            known = (one for one in (*DETECTION_COLUMNS[1:], "attributes") if getattr(boxes, one) is not None)
             columns = {name: getattr(boxes, name)[rows] for name in known}
             pose, view = self.poses[index], None
             if boxes.reports is not None and len(rows) == 1:

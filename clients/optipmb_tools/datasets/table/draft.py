@@ -122,6 +122,7 @@ class TableRows:
     sensor_column: str  # one of `key_columns`, with the sensor; empty: none
     keys: Mapping[str, tuple[str, ...]]  # key -> values of the columns that it stands for
     apart: tuple[str, ...] = ()  # classes whose boxes are things of their own, however close
+    attributes: NDArray[np.object_] | None = None  # (B,) texts by name; None: no columns of the table are attributes
     camera: "GroundCamera | None" = None  # that placed the boxes
 
     def rows(self, first: int, last: int) -> "TableRows":

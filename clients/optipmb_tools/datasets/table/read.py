@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from optipmb_tools.box_records import frame_numbers
 from optipmb_tools.datasets.table import frames, headings, kept, names, places, poses, roles, scores, sizes, times
@@ -13,7 +14,7 @@ from optipmb_tools.datasets.table.columns import TableColumn
 from optipmb_tools.datasets.table.draft import Draft, TableRows
 from optipmb_tools.datasets.table.findings import Reading
 from optipmb_tools.files import DatasetError
-from optipmb_tools.table_files import Columns, read_table
+from optipmb_tools.table_files import NO_VALUE, Columns, read_table
 
 STEPS: Final = (
     *(roles.step, names.keys, times.step, names.step, places.step, sizes.step, headings.step, scores.step, kept.step),
@@ -142,5 +143,21 @@ def _boxes(reading: Reading, draft: Draft) -> TableRows:
         sensor_column="" if sensor is None else sensor.name,
         keys=draft.keys,
         apart=draft.apart,
+        attributes=_attributes(reading, draft) if draft.scored and "attributes" in reading.options else None,
         camera=draft.placed.camera if draft.placed else None,
     )
+
+
+def _attributes(reading: Reading, draft: Draft) -> NDArray[np.object_]:
+    """Return the texts of each box by the names of the columns that the option `attributes` names."""
+    found = np.array([{} for _ in draft.row], np.object_)
+    for name in map(str.strip, reading.options["attributes"].split(",")):
+        if name not in draft.columns:
+            raise DatasetError(reading.path, f"a column {name} (--option attributes)", ", ".join(draft.columns))
+        values = draft.columns[name][draft.row]
+        if values.dtype.kind == "f":  # numbers of a column that has none in some rows
+            values = np.where(np.isnan(values), "", np.char.mod("%.15g", values))
+        for texts, text in zip(found, np.char.strip(values.astype(np.str_)).tolist(), strict=True):
+            if text not in NO_VALUE:
+                texts[name.removeprefix("attributes.")] = text
+    return found
