@@ -191,7 +191,9 @@ def test_the_page_takes_a_token_and_shows_zones(chrome: Chrome, tmp_path: Path) 
             chrome.find_element("id", "secret").send_keys("secret\n")
             wait(chrome, "at('state').textContent === 'ready' && at('token').hidden")
             wait(chrome, "at('zones').rows.length === 2 && at('events').children.length > 2")
-            assert chrome.execute_script("return at('zones').rows[1].cells[0].textContent") == "yard"
+            cells = chrome.execute_script("return [...at('zones').rows[1].cells].map((cell) => cell.textContent)")
+            assert cells[0] == "yard"
+            assert cells[2] == cells[3] != "0"  # entered, distinct
             wait(chrome, "at('streams').rows[0].cells[5].textContent === 'now'")
             dark = {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
             for features, is_dark in ((dark, True), ({"features": []}, False)):

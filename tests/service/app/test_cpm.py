@@ -338,6 +338,12 @@ def test_the_region_of_a_sensor_is_its_newest_field_of_view(
     assert sensor["perception_region_shape"] == {"radial": radial}
 
 
+def test_the_id_is_that_of_the_object() -> None:
+    """A track that was joined over a gap has the id of its object, and one that is not decided its own."""
+    known = {"object": [3, 2, -1], "object_probability": np.array([1.0, 0.98, 1.0], np.float32)}
+    assert ids(texts(station(), frame(0, [3, 9, 11], **known))) == [3, 2, 11]
+
+
 def test_objects_without_a_place_are_left_out_and_counted() -> None:
     """Too far, with the number of an older one, beyond eight messages; all of them where stamps are not in UTC."""
     counted: collections.Counter[str] = collections.Counter()

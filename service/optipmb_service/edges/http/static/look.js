@@ -163,8 +163,8 @@ function showZones() {
   at("zones-part").hidden = zones.length === 0;
   at("zones").replaceChildren(...zones.map(({ name, line }) => {
     const row = document.createElement("tr"), one = counts[name];
-    const cells = line ? ["", `${sum(one, "to_left")} to the left`, `${sum(one, "to_right")} to the right`]
-      : [sum(one, "inside"), sum(one, "entered"), sum(one, "left")];
+    const cells = line ? ["", `${sum(one, "to_left")} to the left`, "", `${sum(one, "to_right")} to the right`]
+      : ["inside", "entered", "distinct", "left"].map((count) => sum(one, count));
     for (const content of [name, ...cells]) row.insertCell().append(content);
     return row;
   }));
