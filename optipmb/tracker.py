@@ -24,7 +24,7 @@ from optipmb.filter.update import first_detected_states, ukf_updates
 from optipmb.joining.decision import Kinds, Rejoin, rejoin_tracks
 from optipmb.learning.self_calibration import calibrated, followed
 from optipmb.learning.sensor_motion import follow_sensor
-from optipmb.model.attributes import read
+from optipmb.model.attributes import MOST_OBJECTS, read
 from optipmb.model.density import (
     NO_FRAME,
     OBJECT,
@@ -343,7 +343,7 @@ class Tracker:
 
 
 def _of_present(attributes: Attributes, density: Density) -> Attributes | None:
-    """Return the attributes of the objects of a density and of lost ones; None: there are none."""
+    """Return the attributes of the newest objects of a density and of lost ones; None: there are none."""
     lost = () if density.rejoining is None else density.rejoining.lost.id
-    rows = np.isin(attributes.id, np.concatenate((density.bernoulli.id, lost)))
-    return attributes.take(rows) if rows.any() else None
+    newest = np.intersect1d(attributes.id, np.concatenate((density.bernoulli.id, lost)))[-MOST_OBJECTS:]
+    return attributes.take(np.isin(attributes.id, newest)) if len(newest) else None

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 MOST_NAMES: Final = 8
 MOST_TEXTS: Final = 4
+MOST_OBJECTS: Final = 5000
+"""Objects with attributes, the newest: readers of messages accept those of 7,000 by default."""
 MOST_BYTES: Final = 32
 """Longest name and text, bytes of UTF-8, and"""
 WORDS: Final = MOST_BYTES // 8

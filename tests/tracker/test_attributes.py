@@ -87,6 +87,14 @@ def test_memory_is_bounded() -> None:
     assert set(texts_of(kept.name)) == {f"name {n}" for n in range(4, 12)}
 
 
+def test_the_newest_objects_keep_their_attributes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of more objects than have attributes at once, the older ones lose theirs."""
+    monkeypatch.setattr("optipmb.tracker.MOST_OBJECTS", 2)
+    cars = gaps.cars((0, 3, (0, 0), (8, 0)), (1, 3, (0, 20), (8, 0)), (2, 3, (0, 40), (8, 0)))[:25]
+    tracks = tracked(cars, lambda _: {"plate": "AB 1"})
+    assert tracks.id[tracks.attributes["plate"][1] > 0.0].tolist() == [2, 3]
+
+
 @pytest.mark.parametrize(
     ("given", "path"),
     [
