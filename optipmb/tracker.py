@@ -317,9 +317,10 @@ class Tracker:
         if self._rejoin is not None:
             before = density.rejoining, posterior, tracks, self._rejoin, self._kinds
             joined = rejoin_tracks(*before, frame.embedding, (chosen, after.measurement))
-            posterior, tracks = joined.density, joined.tracks
-            objects, pi = posterior.bernoulli, posterior.class_probability
-            rows = np.searchsorted(objects.id, tracks.id)
+            posterior = joined.density
+            if joined.tracks is not tracks:
+                tracks, objects, pi = joined.tracks, posterior.bernoulli, posterior.class_probability
+                rows = np.searchsorted(objects.id, tracks.id)
         if posterior.attributes is not None:
             posterior = replace(posterior, attributes=_of_present(posterior.attributes, posterior))
         paths = paths_of(tracks, self._horizons, table) if self._horizons.size else None

@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -83,6 +83,7 @@ MOST_SCORES: Final = 20_000
 MOST_PAIRS: Final = 4000
 """Most pairs of the matching of a frame; the lowest scores are left out first."""
 _NS: Final = 1e-9
+_NONE: Final = np.zeros(0, np.int64)
 
 _BOUNDS: Final = MappingProxyType(
     {
@@ -426,17 +427,47 @@ def _objects_of(identity: Index, live: Tracklets) -> tuple[Index, Array, Index, 
 
 @kernel
 def advance(
-    given: Columns,
+    given: tuple[Array, Array, Array],
     moment: tuple[Array, Array, int],
-    kinds: Columns,
+    motion: Array,
     limits: tuple[float, float, float, int],
-    looks: tuple[Columns, Columns],
-) -> tuple[Array, Array, Array, Array, Array, Array, Array, Index, Array, Index, Array, Index, int, int]:
-    """Return the words of `Rejoining` after a frame.
+) -> tuple[Array, Array, Array, Index, Array, Index, Array, bool]:
+    """Return the words of the live tracks, their places and the lost objects after a frame, before any decision.
 
     Args:
         given: those before it.
         moment: words of the tracks of the frame and of the objects of the density, and the stamp.
+        motion: `Kinds.motion`.
+        limits: the first fields of `Rejoin`.
+
+    Returns:
+        The words; object and probability, candidate and its probability (N,) of the tracks of the frame; and whether a
+        track is decided or a lost object is dropped, which `settle` does.
+    """
+    track_words, object_words, stamp_ns = moment
+    live_words, place_words, lost_words = follow(given, track_words, object_words, stamp_ns, motion)
+    live, lost = tracklets_in(live_words), tracklets_in(lost_words)
+    changes = lost.id.shape[0] > limits[3]
+    for is_due in _rivals(live, stamp_ns, limits[2])[1]:
+        changes = changes or is_due
+    for last_ns in lost.last_ns:
+        changes = changes or (stamp_ns - last_ns) * _NS > limits[0]
+    return live_words, place_words, lost_words, *_objects_of(tracks_in(track_words).id, live), changes
+
+
+@kernel
+def settle(
+    given: Columns,
+    moment: tuple[Array, int],
+    kinds: Columns,
+    limits: tuple[float, float, float, int],
+    looks: tuple[Columns, Columns],
+) -> tuple[Array, Array, Array, Array, Array, Array, Array, Index, Array, Index, Array, Index, int, int]:
+    """Decide on the tracks of a frame and drop lost objects; return the words of `Rejoining`.
+
+    Args:
+        given: those before.
+        moment: words of the tracks of the frame, and the stamp.
         kinds: the fields of `Kinds`.
         limits: the first fields of `Rejoin`.
         looks: the fields of `Vectors` and of `KnownTexts`.
@@ -448,10 +479,7 @@ def advance(
     """
     live_words, place_words, lost_words, begun_words, return_words, end_words, class_words = given
     gap_s, least, decide_s, most = limits
-    track_words, object_words, stamp_ns = moment
-    live_words, place_words, lost_words = follow(
-        (live_words, place_words, lost_words), track_words, object_words, stamp_ns, kinds[0]
-    )
+    track_words, stamp_ns = moment
     live = tracklets_in(live_words)
     young, due = _rivals(live, stamp_ns, decide_s)
     joined, ends = 0, np.empty(0, np.int64)
@@ -532,8 +560,6 @@ def rejoin_tracks(
         FrameError: vectors of another length than before.
     """
     state = before or Rejoining.empty(len(kinds.kind), density.stamp_ns)
-    parts = state.live, state.places, state.lost, state.beginnings, state.returns, state.ends, state.classes
-    given = tuple(one.words for one in parts)
     gap_s = settings.gap_s if density.sensor_motion is None else 0.0
     limits = gap_s, settings.min_probability, settings.decide_s, settings.most
     looks, vectors, (chosen, measurement) = None, NOTHING, detections
@@ -542,26 +568,29 @@ def rejoin_tracks(
         identity = tracks.id[rows]
         source = chosen[measurement[np.searchsorted(density.bernoulli.id, identity)]]
         looks = seen(state, model, embedding, (identity, tracks.label[rows], source), kinds.kind, density.stamp_ns)
-    if looks is not None:
-        appearance, ids = looks
-        vectors = Vectors(ids, appearance.total, state.lost.id, appearance.lost, appearance.counts)
-    *words, objects, probability, candidate, chance, ended, joins, dropped = advance(
-        given,
+    live, places, lost, objects, probability, candidate, chance, changes = advance(
+        (state.live.words, state.places.words, state.lost.words),
         (tracks.words, density.bernoulli.words, density.stamp_ns),
-        (*kinds[:3], tuple(kinds.declared)),
+        kinds.motion,
         limits,
-        (tuple(vectors), tuple(KnownTexts.of(density.attributes))),
     )
-    live, places, lost, begun, returns, ends, known = words
-    after = Rejoining(
-        Tracklets.of(live),
-        Places.of(places),
-        Lost.of(lost),
-        Beginnings.of(begun),
-        Returns.of(returns),
-        Ends.of(ends),
-        Statistics.of(known),
-    )
+    rest: tuple[Any, ...] = state.beginnings, state.returns, state.ends, state.classes
+    ended, joins, dropped = _NONE, 0, 0
+    if changes:
+        if looks is not None:
+            appearance, ids = looks
+            vectors = Vectors(ids, appearance.total, state.lost.id, appearance.lost, appearance.counts)
+        words = settle(
+            (live, places, lost, *(one.words for one in rest)),
+            (tracks.words, density.stamp_ns),
+            (*kinds[:3], tuple(kinds.declared)),
+            limits,
+            (tuple(vectors), tuple(KnownTexts.of(density.attributes))),
+        )
+        live, places, lost, begun, returns, ends, known = words[:7]
+        objects, probability, candidate, chance, ended, joins, dropped = words[7:]
+        rest = Beginnings.of(begun), Returns.of(returns), Ends.of(ends), Statistics.of(known)
+    after = Rejoining(Tracklets.of(live), Places.of(places), Lost.of(lost), *rest)
     if looks is not None:
         after = replace(after, appearance=aligned(*looks, state.lost, after.live, after.lost))
     texts = None if density.attributes is None else _of_objects(density.attributes, state, after.live)
