@@ -39,6 +39,7 @@ from optipmb.joining.evidence import (
 from optipmb.joining.following import PLACE_COLUMNS, TRACKLETS, follow
 from optipmb.joining.matching import match
 from optipmb.joining.places import (
+    BY_END,
     MOST_CORNERS,
     MOST_SHAPES,
     RECENT_NS,
@@ -46,6 +47,7 @@ from optipmb.joining.places import (
     Passage,
     Polygon,
     beginnings_around,
+    ends_around,
     in_exit,
     learned_score,
     passage_score,
@@ -114,7 +116,7 @@ class Rejoin:
     """
 
     gap_s: float = 60.0
-    min_probability: float = 0.97
+    min_probability: float = 0.95
     decide_s: float = 0.3
     most: int = 1000
     embedding_model: str | None = None
@@ -244,6 +246,8 @@ def _scores(
                 if value + max(appeared[at, m], 0.0) > least_log and not in_exit(declared, table.end[n]):
                     if math.isnan(log_rate):
                         around = beginnings_around(begun, c, live.id[k], live.begin[k, 0], live.begin[k, 1])
+                        around += BY_END * ends_around(lost, ends[ends < many], live, k, kind)
+                        around += BY_END * ends_around(live, ends[ends >= many] - many, live, k, kind)
                         log_rate = math.log(0.5 * (everywhere + around) / seconds)
                     value = round((value + appeared[at, m] - log_rate) / QUANTUM) * QUANTUM
                 else:

@@ -1,7 +1,8 @@
 """Places where objects begin, are gone, and return: learned while tracking, or declared as exits and passages.
 
-lambda is the rate of new objects, half uniform over the area of the class, half around other beginnings. Each beginning
-counts with the probability that it was new; objects in view when a session or one of its sensors starts count nothing.
+lambda is the rate of new objects, half uniform over the area of the class, half around other beginnings and ends. Each
+beginning counts with the probability that it was new; objects in view when a session or one of its sensors starts count
+nothing. Each object that is lost counts `BY_END`: where one leaves, others come, also where none was seen to come yet.
 
 Objects lost in an exit do not return, and objects that begin there are new. An object lost at the start of a passage
 may be seen again at its end after a time within bounds, which adds a part to p(y, T | i): most objects keep their speed
@@ -40,6 +41,8 @@ PACE: Final = 0.12
 """Standard deviation of the speed in a passage from the one before or behind it, relative."""
 BY_PACE: Final = 0.95
 """Share of the objects in a passage that keep their speed; the time of the others is uniform within the bounds."""
+BY_END: Final = 0.1
+"""Beginnings that an end stands for: with it, joins are right about as often as their probabilities say."""
 LEARNED_NS: Final = 600 * 10**9
 """Time in which returns teach where others return."""
 ELSEWHERE_M: Final = 6.0
@@ -264,6 +267,17 @@ def beginnings_around(begun: Beginnings, kind: int, identity: int, x: float, y: 
         square = (begun.place[n, 0] - x) ** 2 + (begun.place[n, 1] - y) ** 2
         if square < far and begun.kind[n] == kind and begun.id[n] != identity:
             total += begun.new[n] * math.exp(-0.5 * square / KERNEL_M**2)
+    return total / (2.0 * math.pi * KERNEL_M**2)
+
+
+@kernel
+def ends_around(i: Tracklets, rows: Index, j: Tracklets, k: int, kind: Index) -> float:
+    """Return how many tracks of rows ended around the place at which row `k` began later, per m^2."""
+    total, far = 0.0, (5.0 * KERNEL_M) ** 2
+    for n in rows:
+        square = (i.end[n, 0] - j.begin[k, 0]) ** 2 + (i.end[n, 1] - j.begin[k, 1]) ** 2
+        if square < far and kind[i.label[n]] == kind[j.label[k]] and i.last_ns[n] < j.first_ns[k]:
+            total += math.exp(-0.5 * square / KERNEL_M**2)
     return total / (2.0 * math.pi * KERNEL_M**2)
 
 

@@ -566,7 +566,7 @@ class RejoinSettings(BaseModel):
 
     gap_s: float = Field(default=60.0, gt=0, le=600)
     """longest gap"""
-    min_probability: float = Field(default=0.97, ge=0.5, lt=1)
+    min_probability: float = Field(default=0.95, ge=0.5, lt=1)
     """least probability of a join; below it a track is a new object"""
     decide_s: float = Field(default=0.3, ge=0, le=5)
     """time from the first detection of a track to its decision"""

@@ -57,6 +57,22 @@ def test_a_car_behind_a_building_is_the_same_object() -> None:
     assert tracks.columns()["object"].tolist() == [1]
 
 
+def test_where_an_object_was_lost_a_join_needs_more() -> None:
+    """A car is less likely the one before the gap if yet another one, of another plate, was lost where it begins."""
+
+    def chance(y: float) -> float:
+        tracker = Tracker(GENERIC, rejoin=Rejoin())
+        density = tracker.initial()
+        for one in gaps.cars((0, 3, (0, 0), (8, 0)), (7, 10, (0, 0), (8, 0)), (0, 2, (56, y), (0, 0))):
+            texts = [{"plate": "A" if abs(place) < 1.0 else "B"} for place in one["center"][:, 1]]
+            result = tracker.step(density, optipmb.make_frame(GENERIC, **one, attributes=texts)[0])
+            density = result.density
+        assert result.joined is not None
+        return float(result.joined.candidate_probability[0])
+
+    assert chance(3.0) < chance(60.0) < 1.0
+
+
 @pytest.mark.parametrize("more", [(), ((7, 10, (0, -2.5), (8, 0)),)])
 def test_without_a_sure_candidate_it_is_a_new_object(more: Any) -> None:
     """A gap beyond the limit, or two cars that appear as mirror images ahead, make new objects."""
