@@ -1,7 +1,7 @@
 """Make small faults in the product and see which the nearest tests miss: `python benchmarks/mutants.py SEED N [CAP_S]`.
 
 The same seed and sources give the same faults. Each is made in a copy of the tree, so that the tree is never touched.
-Where a fault is in the tracker, its kernels run as Python. Undecided are a run beyond CAP_S seconds (default 240), for
+Where a fault is in the tracker, its kernels run as Python. Undecided are a run beyond CAP_S seconds (default 900), for
 a fault that hangs or a busy machine, and a test that fails without the fault, too.
 """
 
@@ -141,6 +141,7 @@ def run(folder: Path, tests: list[str], cap_s: float, *, python: bool) -> list[s
     roots = os.pathsep.join(str(folder / part) for part in ("", "schemas", "service", "clients"))
     environment = os.environ | {"PYTHONPATH": roots} | ({"NUMBA_DISABLE_JIT": "1"} if python else {})
     options = ["-q", "-x", "-p", "no:cacheprovider", "-m", "not bounds and not ray and not alone and not accuracy"]
+    options += ["--timeout", "0"]  # kernels as Python take longer than a test may: the run is bounded as a whole
     command = ["nice", sys.executable, "-m", "pytest", *options, *tests]
     with subprocess.Popen(
         command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
@@ -193,4 +194,4 @@ def main(seed: int, count: int, cap_s: float) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]) if len(sys.argv) > 3 else 240.0)
+    main(int(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]) if len(sys.argv) > 3 else 900.0)

@@ -12,7 +12,7 @@ from scipy.stats import lognorm
 
 import optipmb
 from optipmb import OnlineTracker, ParameterError, Passage, Rejoin, Relocation, Tracker, generic_parameters
-from optipmb.joining import places, records
+from optipmb.joining import decision, places, records
 from optipmb.model.lost_objects import Ends, Returns, Tracklets
 
 GENERIC = generic_parameters(gaps.CLASSES, 0.1)
@@ -307,6 +307,18 @@ def test_settings_out_of_bounds_are_named(value: dict[str, Any], path: str) -> N
     """A value out of its bounds raises an error that names it."""
     with pytest.raises(ParameterError, match=f"rejoin.{path}"):
         Rejoin(**value)
+
+
+def test_whole_numbers_compile_nothing_anew() -> None:
+    """Limits in whole seconds give the same objects with the machine code that is there."""
+
+    def compiled() -> int:
+        return len(getattr(decision.advance, "signatures", ()))
+
+    found = objects(HIDDEN, Rejoin(gap_s=60.0, decide_s=1.0))
+    before = compiled()
+    assert objects(HIDDEN, Rejoin(gap_s=60, decide_s=1)) == found
+    assert compiled() == before
 
 
 def test_most_joins_are_right() -> None:
