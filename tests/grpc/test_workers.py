@@ -1,7 +1,5 @@
 """gRPC served by a service of several worker processes: its parent is the gateway of them all."""
 
-from collections.abc import Iterator
-
 import grpc
 import pytest
 from gateway import channel_to, detections, frame
@@ -14,18 +12,27 @@ from service_process import ServiceProcess
 STREAMS = tuple(f"garage/robot-{number}/lidar" for number in range(4))
 
 
-@pytest.fixture(scope="module")
-def workers() -> Iterator[tuple[ServiceProcess, str]]:
+def test_streams_of_all_workers() -> None:
+    """Streams of both workers are tracked, listed with their worker, asked about, reset and queried at one address.
+
+    On SIGTERM a subscription ends as UNAVAILABLE, and the service with status 0.
+    """
     address = f"127.0.0.1:{free_endpoint().rpartition(':')[2]}"
     with ServiceProcess("--workers", "2", "--grpc", address, "--instance", "garage") as process:
         process.wait_ready()
-        yield process, address
+        stub = rpc.TrackingServiceStub(channel_to(address))
+        serves_all(stub, process.endpoint)
+        call = stub.Subscribe(pb.SubscribeRequest(pattern="*/*/*"))
+        call.initial_metadata()
+        status, _ = process.end()
+        with pytest.raises(grpc.RpcError) as raised:
+            list(call)
+        assert raised.value.code() == grpc.StatusCode.UNAVAILABLE
+        assert status == 0, process.errors
 
 
-def test_streams_of_all_workers(workers: tuple[ServiceProcess, str]) -> None:
-    """Streams of both workers are tracked, listed with their worker, asked about, reset and queried at one address."""
-    stub = rpc.TrackingServiceStub(channel_to(workers[1]))
-    with Node(workers[0].endpoint) as node:
+def serves_all(stub: rpc.TrackingServiceStub, endpoint: str) -> None:
+    with Node(endpoint) as node:
         for number, stream in enumerate(STREAMS):
             node.move("garage", stream, number % 2)
     for stream in STREAMS:
@@ -40,15 +47,3 @@ def test_streams_of_all_workers(workers: tuple[ServiceProcess, str]) -> None:
     assert {one.instance for one in listed} == {listed[0].instance}
     before = stub.GetState(pb.GetStateRequest(stream=STREAMS[0])).state.session
     assert stub.Reset(pb.ResetRequest(stream=STREAMS[0])).state.session not in {"", before}
-
-
-def test_the_end_is_in_order(workers: tuple[ServiceProcess, str]) -> None:
-    """On SIGTERM a subscription ends as UNAVAILABLE, and the service with status 0."""
-    process, address = workers
-    call = rpc.TrackingServiceStub(channel_to(address)).Subscribe(pb.SubscribeRequest(pattern="*/*/*"))
-    call.initial_metadata()
-    status, _ = process.end()
-    with pytest.raises(grpc.RpcError) as raised:
-        list(call)
-    assert raised.value.code() == grpc.StatusCode.UNAVAILABLE
-    assert status == 0, process.errors
