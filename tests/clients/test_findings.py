@@ -37,6 +37,14 @@ def test_right_tables_have_no_doubtful_finding(tmp_path: Path, changed: dict[str
     assert troubles(tmp_path / "d.csv", street(**changed)) == []
 
 
+def test_of_two_columns_with_one_word_each_the_first_name_is_the_class(tmp_path: Path) -> None:
+    """A column that says the same of all boxes does not take the place of another such one."""
+    columns = street()
+    columns["type"] = np.full(len(columns["t"]), "detected")
+    columns["class"] = np.full(len(columns["t"]), "car")
+    assert looked(tmp_path / "d.csv", columns)[0].sequences(["all"])[0].labels == ("car",)
+
+
 @pytest.mark.parametrize("changed", [{}, {"ray": 0.02}])
 @pytest.mark.parametrize(("name", "turn"), [("y", -0.5 * np.pi), ("-y", 0.5 * np.pi)])
 def test_wrong_headings_are_refused_beside_jitter(

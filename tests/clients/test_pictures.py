@@ -34,20 +34,35 @@ def scene() -> tuple[DataSequence, Truth, ResultTable]:
     return sequence, truth, ResultTable(rows.labels, *columns, np.ones(len(rows)), rows.box2d)
 
 
-def text_of(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: object) -> list[str]:
+def figure_of(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: object) -> Any:
     from matplotlib.figure import Figure  # noqa: PLC0415 - matplotlib is an extra
-    from matplotlib.text import Text  # noqa: PLC0415 - matplotlib is an extra
 
-    found: list[str] = []
+    found: list[Figure] = []
     save = Figure.savefig
 
     def remember(figure: Figure, *args: object, **options: object) -> None:
         save(figure, *args, **options)
-        found.extend(text.get_text() for text in figure.findobj(Text))
+        found.append(figure)
 
     monkeypatch.setattr(Figure, "savefig", remember)
     draw_tracks(path, *arguments)  # type: ignore[arg-type]  # passed on as they are
-    return found
+    return found[0]
+
+
+def text_of(path: Path, monkeypatch: pytest.MonkeyPatch, *arguments: object) -> list[str]:
+    from matplotlib.text import Text  # noqa: PLC0415 - matplotlib is an extra
+
+    return [text.get_text() for text in figure_of(path, monkeypatch, *arguments).findobj(Text)]
+
+
+def test_tracks_and_truth_are_inside_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With room for the boxes around the outermost centres."""
+    sequence, truth, tracks = scene()
+    axes = figure_of(tmp_path / "a.png", monkeypatch, sequence, [Panel(tracks, [])], truth).axes[0]
+    places = np.vstack((truth.center, tracks.center))[:, :2]
+    for limits, along in zip((axes.get_xlim(), axes.get_ylim()), places.T, strict=True):
+        assert limits[0] < along.min() - 2.0
+        assert limits[1] > along.max() + 2.0
 
 
 def test_a_miss_with_a_track_that_is_not_confirmed_shows_that_track(
