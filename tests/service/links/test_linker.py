@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from optipmb_schemas import Tracks, decode, encode, encoding_of
+from optipmb_service.links.inputs import LinkInputs
 from optipmb_service.links.linker import Linker
 from optipmb_service.links.places import WorldFrame
 from optipmb_service.settings import LinkSettings
@@ -68,6 +69,26 @@ def site() -> tuple[World, list[Tracks]]:
     world = plaza(3, 12.0)
     east = dataclasses.replace(EAST, shift=(0.4, -0.3), turn=np.radians(1.0), late=0.1)
     return world, together(copied(world, WEST, 3), copied(world, east, 3))
+
+
+def test_tracks_in_the_plane_of_the_area() -> None:
+    """Places, velocities and covariances of a world frame are turned and moved as the matrices say."""
+    rng, yaw, count = np.random.default_rng(0), 0.7, 20
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    factor = rng.standard_normal((count, 6, 6))
+    covariance = factor @ factor.transpose(0, 2, 1) + 0.1 * np.eye(6)
+    center, velocity = rng.uniform(-50, 50, (count, 3)), rng.uniform(-9, 9, (count, 2))
+    columns = {"center": center, "velocity": velocity, "covariance": covariance}
+    message = tracks_message("a/n/s", 0, list(range(count)), stamp_ns=BEGIN_NS, confirmed=1, **columns)
+    inputs = LinkInputs(lambda _: WorldFrame(x=3.0, y=-4.0, yaw=yaw))
+    stream = inputs.accept(message, BEGIN_NS, -1)
+    assert stream is not None
+    inputs.add(stream, message, None)
+    look = stream.looks[-1]
+    np.testing.assert_allclose(look.place, message.center[:, :2] @ turn.T + (3.0, -4.0))
+    np.testing.assert_allclose(look.velocity, message.velocity @ turn.T, rtol=1e-5)
+    wanted = turn @ message.covariance[:, :2, :2] @ turn.T
+    np.testing.assert_allclose(look.covariance, wanted[:, [0, 0, 1], [0, 1, 1]], rtol=1e-4, atol=1e-6)
 
 
 def test_overlap(site: tuple[World, list[Tracks]]) -> None:
