@@ -28,18 +28,11 @@ from routers import free_endpoint
 from service_process import READY_S, ServiceProcess
 from takeovers import KEYS, check, distinct, longest_silence_s, outage_s, published_by, send
 
-import optipmb
-
 SENSORS = [Sensor(stream=f"site/node-{number}/lidar") for number in range(6)]
 FREEZE_S = 5.0
 """Longer than a lease, and than the links of a frozen process last."""
 SLACK_S = 6.0
 """For a busy machine."""
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _compiled() -> None:
-    optipmb.warm_up()
 
 
 class Cluster:

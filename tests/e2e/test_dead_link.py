@@ -11,19 +11,12 @@ from router import Sensor, until
 from service_process import ServiceProcess
 from takeovers import expected
 
-import optipmb
-
 KEYS = Keys()
 STREAM = "site/node/lidar"
 RATE_S = 0.05
 FRAMES = 160
 """More after the link has died than a cache of tracks holds."""
 FRAME = {"label": ["car"], "center": [[1.0, 2.0, 0.0]], "size": [[4.0, 2.0, 1.5]], "yaw": [0.0], "score": [0.9]}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _compiled() -> None:
-    optipmb.warm_up()
 
 
 @pytest.mark.parametrize("side", ["publisher", "subscriber"])

@@ -6,19 +6,11 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
 from fleet import Fleet
 from optipmb_client import Publisher
 from optipmb_schemas import ServiceStatus
 from router import Node, until
 from takeovers import KEYS, SENSOR, check, published_by, send
-
-import optipmb
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _compiled() -> None:
-    optipmb.warm_up()
 
 
 def test_terminated_in_the_middle(tmp_path: Path) -> None:

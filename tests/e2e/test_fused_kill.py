@@ -75,7 +75,6 @@ def moved_with_its_sensor(node: Node, session: str, before: SessionState) -> Non
 )
 def test_killed_while_two_sensors_feed_one_session(tmp_path: Path, session: str, settings: dict[str, Any]) -> None:
     """State and tracks equal a run without a kill, to the byte: with workers, with nodes of a site, unequal sensors."""
-    optipmb.warm_up()
     frames: list[Detections] = drive(40)
     sensors = optipmb.Sensors.read(UNEQUAL if "sensors" in settings else {})
     policy = Policy(recovery_wait_ns=0, sensors=sensors)

@@ -21,14 +21,7 @@ from router import Node, Sensor, plain, until
 from service_process import ServiceProcess
 from takeovers import KEYS, check, expected
 
-import optipmb
-
 SENSORS = [Sensor(stream=f"site/node-{number}/lidar") for number in range(3)]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _compiled() -> None:
-    optipmb.warm_up()
 
 
 class Logged:

@@ -29,11 +29,6 @@ ROUND_S = 5.0
 """After which a cloud that did not come is taken for lost."""
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _compiled() -> None:
-    optipmb.warm_up()
-
-
 class Pair:
     """Two services, each behind a proxy that counts the bytes sent to it; a node at the first."""
 

@@ -9,14 +9,11 @@ from fleet import Fleet, freeze
 from router import Node, until
 from takeovers import KEYS
 
-import optipmb
-
 SCENE = ("--dataset", "scene", "--profile", "kitti", "--option", "frames=70", "--option", "vehicles=6")
 
 
 def test_no_cloud_is_lost_by_a_takeover(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The result equals offline tracking, byte for byte, though the takeover takes longer than the cloud cache."""
-    optipmb.warm_up()
     done = run_here(capsys, "track", *SCENE, "--out", str(tmp_path / "offline"))
     assert done.returncode == 0, done.stderr
     with Fleet(tmp_path / "store", checkpoint_s=0.3) as fleet, Node(fleet.endpoint) as node:

@@ -16,8 +16,6 @@ from optipmb_client.sessions import find_services
 from optipmb_schemas import Detections, Keys, ServiceStatus, encode, encoding_of
 from router import Sensor
 
-import optipmb
-
 SECONDS = float(os.environ.get("OPTIPMB_TEST_SOAK_S", "14"))
 STREAMS = int(os.environ.get("OPTIPMB_TEST_SOAK_STREAMS", "5"))
 CLOUD_STREAMS = max(1, STREAMS // 10)
@@ -54,7 +52,6 @@ def test_nothing_grows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
 
     Streams with and without clouds, and one that also sends every frame twice and garbage between.
     """
-    optipmb.warm_up()
     loads = {
         Load(STREAMS, RATE_HZ, SECONDS, "nuscenes"): generated(OBJECTS, 0, RATE_HZ),
         Load(CLOUD_STREAMS, RATE_HZ, SECONDS, "nuscenes"): generated(OBJECTS, POINTS, RATE_HZ),
