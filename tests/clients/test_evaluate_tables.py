@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import result_of, run_here
+from optipmb_tools.commands import options
+from optipmb_tools.run.bulk import Here
 from optipmb_tools.table_files import read_table, write_table
 
 FRAMES, CARS = 50, 2
@@ -73,6 +75,21 @@ def counts(done: Any, name: str = "car") -> tuple[float | None, int, int, int]:
     """Give MOTA in percent, truth boxes, false and missed ones of all tracks."""
     found = result_of(done)["classes"][name]["all"]
     return None if found["MOTA"] is None else round(100 * found["MOTA"], 3), found["GT"], found["FP"], found["FN"]
+
+
+@pytest.mark.parametrize(("worth", "processes"), [(FRAMES - 1, 2), (FRAMES, 1)])
+def test_many_frames_are_evaluated_by_a_process_for_each_class(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, worth: int, processes: int
+) -> None:
+    """Where frames are so few that processes cost more than they save, by this one."""
+    asked: list[int] = []
+    monkeypatch.setattr(options, "WORTH_PROCESSES", worth)
+    monkeypatch.setattr(options, "processors", lambda: 8)
+    monkeypatch.setattr(options, "executor_for", lambda jobs: asked.append(jobs) or Here())
+    truth = cars(**{"class": np.tile(["car", "van"], FRAMES)})
+    found = {name: one for name, one in truth.items() if name != "id"} | {"score": np.full(FRAMES * CARS, 0.9)}
+    assert bench.evaluate(truth, truth, detections=found).returncode == 0
+    assert asked == [processes]
 
 
 RIGHT = (100.0, FRAMES * CARS, 0, 0)
