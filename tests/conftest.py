@@ -3,6 +3,7 @@
 import faulthandler
 import gc
 import os
+import random
 import signal
 import sys
 from collections.abc import Generator
@@ -38,6 +39,9 @@ MACHINE_CODE = ("tracker/test_prepared.py", "tracker/test_returned_arrays.py", "
 PLAIN = os.environ.get("NUMBA_DISABLE_JIT") == "1"
 """Whether kernels run as Python."""
 
+ORDER = os.environ.get("OPTIPMB_TEST_ORDER", "")
+"""Seed of a random order; empty: the order in which all tests take the least time."""
+
 WAITING = ("docker", "e2e", "grpc", "service")
 """Folders whose tests mostly start processes and wait for them."""
 
@@ -64,7 +68,10 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    _interleave(items)
+    if ORDER:
+        _shuffle(items)
+    else:
+        _interleave(items)
     marker_of = {HERE / name: marker for marker, names in OTHERS.items() for name in names}
     left_out = {HERE / name for name in MACHINE_CODE} if PLAIN else set()
     for item in items:
@@ -91,6 +98,13 @@ def _interleave(items: list[pytest.Item]) -> None:
     place = {path: number / len(waiting) for number, path in enumerate(waiting)}
     place |= {path: number / len(computing) for number, path in enumerate(reversed(computing))}
     items.sort(key=lambda item: place[item.path])
+
+
+def _shuffle(items: list[pytest.Item]) -> None:
+    """Put the files in a random order, and the tests of each, which may share what is made for their file."""
+    chance = random.Random(ORDER)
+    place = {path: chance.random() for path in sorted({item.path for item in items})}
+    items.sort(key=lambda item: (place[item.path], chance.random()))
 
 
 def pytest_unconfigure() -> None:
