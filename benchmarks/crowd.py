@@ -149,8 +149,8 @@ def auto(scene: Scene) -> ResultTable:
         result = tracker.step(density, frame)
         density = result.density
         found.append(result.tracks)
-    ends = np.searchsorted(scene.stamps, scene.stamps + 10**9, "right").tolist()
-    later = {k: with_hindsight(found[k], found[k + 1 : end], parameters) for k, end in enumerate(ends)}
+    changed = with_hindsight(found, parameters)
+    later = {k: one.replaced(**columns) for k, (one, columns) in enumerate(zip(found, changed, strict=True))}
     every = full_table((NAME,), later)
     shown = every.take(stacked(list(later.values()), "confirmed").astype(np.bool_))
     return table(shown.frame, shown.id, shown.center[:, :2], shown.score)
