@@ -43,6 +43,8 @@ EXISTENCE: Final = tuple(
 DOUBT: Final = ((0.5, 0.6, 0.8, 0.9, 0.95, 0.98), (3.2, 2.75, 2.4, 2.1, 1.8, 1.0))
 """Lasting errors relative to those of sure tracks, by existence: boxes of far and half-hidden objects, which have low
 scores, are off."""
+WALKERS: Final = ((0.2, 0.5), (0.5, 0.8))
+"""Process noise of the speed of people by the period: within a fifth of a second they go on as they went."""
 HISTORY: Final = (
     {"offset": -0.25, "existence": 0.85, "duration": 0.4, "share": 0.85, "speed": 0.0},
     {"offset": -1.0, "existence": 0.45, "duration": 0.45, "share": 0.5, "speed": 1.2},
@@ -128,7 +130,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "reported_noise": {"position": 0.04, "heading": 0.3} if agile else {"position": 0.06, "heading": 0.06},
         "process_noise": {
             "position": 0.1,
-            "speed": 0.8 if agile else 1.0,
+            "speed": round(float(np.interp(period, *WALKERS)), 3) if agile else 1.0,
             "heading": 0.3 if agile else 0.2 if two_wheeled else 0.08,
             "turn_rate": 0.4 if agile or two_wheeled else 0.15,
             "acceleration": 0.5 if agile else 1.5,
