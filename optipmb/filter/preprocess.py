@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
     from optipmb.model.frame import Frame
     from optipmb.model.rows import Array, Columns, Index
-    from optipmb.model.table import Classes, ClassTable
+    from optipmb.model.table import Classes, ClassRow, ClassTable
 
 
 def preprocess(
@@ -47,28 +47,29 @@ def preprocess(
     Raises:
         EffortError: more than `most` pairs of detections may overlap.
     """
-    own_noise = frame.position_covariance
+    own_noise = NO_NOISE if frame.position_covariance is None else frame.position_covariance
     if score is None:
         score = frame.score
     given = frame.center, frame.size, frame.yaw, frame.velocity, score, frame.label, frame.source
-    above, chosen, columns = select(given, PLAIN if own_noise is None else PLAIN + 3, table.classes, most)
+    above, chosen, columns = select(given, own_noise, table.classes, most)
     if above < 0:
         raise EffortError("center", f"at most {most} pairs of detections that may overlap", "more")
-    measurements = Measurements(*columns)
-    if own_noise is not None:
-        covariance, variance = own_noise[chosen], table["noise_position"][measurements.label, None] ** 2
-        measurements.position[:, PLAIN:] = np.where(np.isnan(covariance), (1.0, 0.0, 1.0), covariance / variance)
-    return measurements, chosen, frame.score.shape[0] - above, above - chosen.shape[0]
+    return Measurements(*columns), chosen, frame.score.shape[0] - above, above - chosen.shape[0]
+
+
+NO_NOISE: Final = np.zeros((0, 3))
+"""In place of the covariances of the positions of a frame where it has none."""
 
 
 @kernel
-def select(detections: Columns, width: int, classes: Classes, most: int) -> tuple[int, Index, Columns]:
+def select(detections: Columns, own_noise: Array, classes: Classes, most: int) -> tuple[int, Index, Columns]:
     """Choose the detections that are measurements, of center, size, yaw, velocity, score, label and source of all.
+
+    `own_noise` (M, 3) are the covariances of their positions, or (0, 3).
 
     Returns:
         How many detections pass the score filter, or -1 when more than `most` pairs of boxes had to be compared; the
-        rows that pass the suppression too, in their order; their columns of `Measurements`, of which the position has
-        `width`: those behind y are not written.
+        rows that pass the suppression too, in their order; their columns of `Measurements`.
     """
     center, size, yaw, velocity, score, label, source = detections
     chosen = np.empty(score.shape[0], np.int64)
@@ -96,6 +97,10 @@ def select(detections: Columns, width: int, classes: Classes, most: int) -> tupl
         if keep[k]:
             chosen[kept] = chosen[k]
             kept += 1
+    width = PLAIN + 3 if own_noise.shape[0] > 0 else PLAIN
+    for k in range(kept):
+        if long_for_noise(size[chosen[k], 0], classes[label[chosen[k]]]):
+            width = PLAIN + 3
     position, velocity_out, auxiliary = np.empty((kept, width)), np.empty((kept, 2)), np.empty((kept, 4))
     yaw_out, score_out = np.empty(kept), np.empty(kept)
     label_out, source_out = np.empty(kept, np.int64), np.empty(kept, np.int64)
@@ -103,11 +108,48 @@ def select(detections: Columns, width: int, classes: Classes, most: int) -> tupl
         m = chosen[k]
         for s in range(2):
             position[k, s], velocity_out[k, s] = center[m, s], velocity[m, s]
+        if width > PLAIN:
+            noise = own_noise[m] if own_noise.shape[0] > 0 else UNKNOWN_NOISE
+            write_noise(noise, size[m, 0], yaw[m], classes[label[m]], position[k])
         for s in range(3):
             auxiliary[k, s] = size[m, s]
         auxiliary[k, 3] = center[m, 2]
         yaw_out[k], score_out[k], label_out[k], source_out[k] = yaw[m], score[m], label[m], source[m]
     return above, chosen[:kept], (position, yaw_out, velocity_out, auxiliary, score_out, label_out, source_out)
+
+
+UNKNOWN_NOISE: Final = np.full(3, np.nan)
+
+
+@kernel
+def long_for_noise(length: float, own: ClassRow) -> bool:
+    """Tell whether the error along an object of a length, m, is more than that of its class; NaN is not."""
+    return own.noise_length * length > own.noise_position
+
+
+@kernel
+def write_noise(noise: Array, length: float, yaw: float, own: ClassRow, position: Array) -> None:
+    """Write the covariance of a detection, relative to R_xy of its class, behind its position.
+
+    That is `noise`, R_xx, R_xy and R_yy in m^2, where it is known. Else the centre of a long object is off along it, by
+    as much as its length tells; in each direction where the heading is not known.
+    """
+    variance = own.noise_position * own.noise_position
+    if not math.isnan(noise[0]):
+        for s in range(3):
+            position[PLAIN + s] = noise[s] / variance
+        return
+    position[PLAIN], position[PLAIN + 1], position[PLAIN + 2] = 1.0, 0.0, 1.0
+    if not long_for_noise(length, own):
+        return
+    more = (own.noise_length * length) ** 2 / variance - 1.0
+    if math.isnan(yaw):
+        position[PLAIN], position[PLAIN + 2] = 1.0 + more, 1.0 + more
+        return
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    position[PLAIN] += more * cos * cos
+    position[PLAIN + 1] = more * cos * sin
+    position[PLAIN + 2] += more * sin * sin
 
 
 @kernel

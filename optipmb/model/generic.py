@@ -28,8 +28,10 @@ REACH: Final = (  # the gate, m, and the standard deviation of an unknown speed,
 GATE_DEVIATIONS: Final = 2.75
 VELOCITY_DEVIATIONS: Final = 2.45  # holds 95 % of the velocities of sound detections
 
-REMEMBERED_S: Final = 2.0
-"""How long an object is kept without a detection."""
+REMEMBERED_S, REMEMBERED_OTHER_S = 2.0, 4.0
+"""How long a road user, and another object, is kept without a detection."""
+OF_LENGTH: Final = 0.1
+"""Error of the centre of another object, which may be a ship, as a share of its length: a part of it is hit."""
 DETECTION_S: Final = 0.5
 """Time that the detection probability holds for: what hides an object hides it about so long."""
 SHOWN_S: Final = 0.3
@@ -83,6 +85,7 @@ def generic_parameters(labels: Iterable[str], period: float, *, name: str = "aut
 def _of_class(kind: str, period: float) -> dict[str, Any]:
     gate, unknown_speed = dict(REACH)[kind]
     agile, two_wheeled, sized = kind == "pedestrian", kind.endswith("cycle"), kind in {"truck", "bus", "trailer"}
+    remembered = REMEMBERED_OTHER_S if kind == OTHER else REMEMBERED_S
     return {
         **({"group": "vehicle", "suppress_in_group": False} if kind in {"car", "truck"} else {}),
         "score_filter": 0.05,
@@ -105,7 +108,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         "extract_new": 0.7,
         "extract_known": 0.8,
         "extract_misses": 1 + max(1, math.ceil(SHOWN_S / period - 0.1)),
-        "max_misses": max(4, round(REMEMBERED_S / period)),
+        "max_misses": max(4, round(remembered / period)),
         "min_existence": 1e-4,  # objects are kept for their time, not for their misses
         "heading_sign": {"speed": 1.0 if agile or two_wheeled else 4.0},  # vehicles reverse at up to 4 m/s
         "birth_heading_speed": 1.0,
@@ -137,6 +140,7 @@ def _of_class(kind: str, period: float) -> dict[str, Any]:
         },
         "measurement_noise": {
             "position": 0.5 if sized else 0.25 if agile or two_wheeled else 0.3,
+            "length": OF_LENGTH if kind == OTHER else 0.0,
             "velocity": 1.0,
             "heading": 0.6 if agile else 0.3,
         },

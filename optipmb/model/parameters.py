@@ -98,6 +98,10 @@ class MeasurementNoise(ParameterTable):
     """Measurement noise R_k of the detector, as standard deviations of z_M = [x, y, v_x, v_y, phi]."""
 
     position: Positive = Field(description="standard deviation of x and of y, m; its square fills R_xy")
+    length: NonNegative = Field(
+        default=0.0,
+        description="of the centre along the heading for each metre of the length, where that is more than `position`",
+    )
     velocity: Positive = Field(description="of v_x and of v_y, m/s; unused where a detection has no velocity")
     heading: Positive = Field(description="of phi, rad")
 

@@ -40,6 +40,7 @@ class ClassRow(Protocol):
         default_size: (3,) length, width and height of an object of which they are unknown, m.
         process_noise: (6,) standard deviations in state order, per square root of a second.
         noise_position: standard deviation of z_x and z_y.
+        noise_length: that of the centre of a long object along its heading, for each metre of its length.
         noise_velocity: of z_vx and z_vy.
         noise_heading: of z_phi.
         reported_position: variance that R_x of `optipmb.filter.calibration` leaves for z_x and z_y; zero without it.
@@ -108,6 +109,7 @@ class ClassRow(Protocol):
     default_size: Size
     process_noise: Spread
     noise_position: float
+    noise_length: float
     noise_velocity: float
     noise_heading: float
     reported_position: float
@@ -270,6 +272,7 @@ def _values(p: ClassParameters) -> dict[str, Any]:
         "constant_velocity": p.motion == "cv",
         "process_noise": (q.position, q.position, q.speed, q.heading, q.turn_rate, q.acceleration),
         "noise_position": noise.position,
+        "noise_length": noise.length,
         "noise_velocity": noise.velocity,
         "noise_heading": noise.heading,
         "reported_position": _left_over(p, "position"),

@@ -11,8 +11,10 @@ from class_rows import class_rows
 
 import optipmb
 from optipmb.filter.hypotheses import gate
+from optipmb.filter.preprocess import preprocess
 from optipmb.filter.update import birth_states, ukf_updates
 from optipmb.model.stages import Measurements
+from optipmb.model.table import ClassTable
 
 CARS, FRAMES, DT_NS = 6, 12, 100_000_000
 HALF = np.pi / 6
@@ -95,6 +97,55 @@ def updated(mean: Any, covariance: Any, z: Any, spread: Any, velocity: Any) -> t
     measured = Measurements(position, np.array([z[2]]), np.array([velocity]), np.empty((1, 4)), np.empty(1), zero, zero)
     assert ukf_updates(zero, zero, mean[None], covariance[None], measured, classes, out, out_spread) == 0
     return out[0], out_spread[0]
+
+
+def test_the_centre_of_a_long_object_is_uncertain_along_it() -> None:
+    """R is that of the class, and along the heading a tenth of the length where that is more; known R stays."""
+    parameters = optipmb.generic_parameters(("boat", "car"), 0.1)
+    sigma = np.array([one.measurement_noise.position for one in parameters.classes.values()])
+    yaw = np.array([0.7, -2.0, np.nan, 0.7, 0.7, 0.7])
+    length, label = np.array([25.0, 12.0, 25.0, 2.0, 25.0, np.nan]), np.array([0, 0, 0, 0, 1, 0])
+    known = np.full((6, 3, 3), np.nan)
+    known[0] = np.diag([0.5, 0.4, 0.3])
+    more = np.where((label == 0) & (length > 3.0), (0.1 * length / sigma[label]) ** 2 - 1.0, 0.0)
+    for given in (None, known):
+        frame, _ = optipmb.make_frame(
+            parameters,
+            stamp_ns=0,
+            labels=("boat", "car"),
+            label=label,
+            center=np.column_stack((50.0 * np.arange(6), np.zeros((6, 2)))),
+            size=np.column_stack((length, length / 5.0, np.full(6, 3.0))),
+            yaw=yaw,
+            score=np.linspace(0.9, 0.8, 6),
+            position_covariance=given,
+        )
+        z, chosen, *_ = preprocess(frame, ClassTable.of(parameters))
+        np.testing.assert_array_equal(chosen, np.arange(6))
+        for k, (xx, xy, yy) in enumerate(z.position[:, 2:]):
+            ahead = np.array([np.cos(yaw[k]), np.sin(yaw[k])])
+            expected = np.eye(2) + more[k] * (np.eye(2) if np.isnan(yaw[k]) else np.outer(ahead, ahead))
+            if given is not None and k == 0:
+                expected = known[0, :2, :2] / sigma[0] ** 2
+            np.testing.assert_allclose([[xx, xy], [xy, yy]], expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_ship_of_which_parts_are_hit_stays_one_track() -> None:
+    """The centre of a ship of 30 m jumps by metres, and it is not seen for three seconds now and then."""
+    tracker, ids, rng = (
+        optipmb.OnlineTracker(optipmb.generic_parameters(("boat",), 0.5)),
+        set(),
+        np.random.default_rng(4),
+    )
+    for k in range(120):
+        seen = int(k % 20 < 15)
+        center = [[2.0 * k + rng.normal(0.0, 2.0), rng.normal(0.0, 0.2), 0.0]]
+        box = {"center": center, "size": [[30.0, 7.0, 5.0]], "yaw": [0.0], "score": [0.9]}
+        tracks = tracker.update(
+            {name: np.array(one)[:seen] for name, one in box.items()}, t=0.5 * k, label=["boat"][:seen]
+        )
+        ids |= set(tracks.id[tracks.confirmed].tolist())
+    assert len(ids) == 1
 
 
 def test_the_update_is_the_kalman_filter_with_that_covariance() -> None:
