@@ -32,11 +32,24 @@ PATIENT = {"OPTIPMB_CLOUD_WAIT_S": "5"}
 """On a busy machine a cloud comes later than the tenth of a second for which a frame waits; its tracks would differ."""
 
 
-@pytest.fixture(scope="module")
-def service() -> Iterator[ServiceProcess]:
-    """A service with its own router, whose frames wait for their clouds."""
+@contextlib.contextmanager
+def patient() -> Iterator[ServiceProcess]:
     with ServiceProcess(environment=PATIENT) as process:
         process.wait_ready()
+        yield process
+
+
+@pytest.fixture(scope="module")
+def service() -> Iterator[ServiceProcess]:
+    """A service with its own router, whose frames wait for their clouds; without sessions between the tests."""
+    with patient() as process:
+        yield process
+
+
+@pytest.fixture
+def fresh() -> Iterator[ServiceProcess]:
+    """A service that knows nothing."""
+    with patient() as process:
         yield process
 
 
@@ -119,16 +132,14 @@ def recorded_replay(service: ServiceProcess, folder: Path, dataset: "Dataset", *
 
 def play_into_another(path: Path, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Play a recording into a service that knows nothing, and record that; all tracks must be the same bytes."""
-    with ServiceProcess(environment=PATIENT) as fresh:
-        fresh.wait_ready()
-        with recording(fresh, folder / "again.mcap") as process:
-            result = result_of(
-                run_here(capsys, "play", path, "--as-recorded", "--connect", fresh.endpoint, "--json"),
-            )
-            returned = sum(stream["returned"] for stream in result["streams"])
-            wait_for(lambda: count(folder / "again.mcap", "tracks") >= returned, fresh)
-            process.send_signal(signal.SIGINT)
-            process.communicate(timeout=DEADLINE_S)
+    with patient() as fresh, recording(fresh, folder / "again.mcap") as process:
+        result = result_of(
+            run_here(capsys, "play", path, "--as-recorded", "--connect", fresh.endpoint, "--json"),
+        )
+        returned = sum(stream["returned"] for stream in result["streams"])
+        wait_for(lambda: count(folder / "again.mcap", "tracks") >= returned, fresh)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=DEADLINE_S)
     names = {stream["name"] for stream in result["streams"]}
     first = {key: content for key, content in newest_tracks(path).items() if key[0] in names}
     again = newest_tracks(folder / "again.mcap")
@@ -211,8 +222,7 @@ def test_tracks_that_differ_are_reported(
 
 def test_a_stream_that_was_tracked_before_is_reported(incident: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Played twice under the recorded name, ids go on from the first time: status 1, and why, in one line."""
-    with ServiceProcess(environment=PATIENT) as fresh:
-        fresh.wait_ready()
+    with patient() as fresh:
         again = ("play", incident, "--as-recorded", "--connect", fresh.endpoint)
         done = run_here(capsys, *again)
         assert (done.returncode, done.stderr) == (0, "")
@@ -264,23 +274,23 @@ def test_what_cannot_be_is_one_line_with_status_2(
 
 
 def test_a_car_keeps_its_id_where_the_world_moves(
-    service: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    fresh: ServiceProcess, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The example of the documentation prints one track in both worlds; its recording plays to the same bytes."""
     page = (REPOSITORY / "docs" / "operation.md").read_text(encoding="utf-8")
     found = re.search(r"# When the world moves.*?```python\n(.*?)```", page, re.DOTALL)
     assert found is not None
-    where = f', connect="{service.endpoint}"'
+    where = f', connect="{fresh.endpoint}"'
     code = found[1].replace("timeout=10)", f"timeout=60{where})").replace('frame="world")', f'frame="world"{where})')
     assert code.count(where) == 2
     path = tmp_path / "moved.mcap"
-    with recording(service, path) as recorder:
+    with recording(fresh, path) as recorder:
         run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=200)
-        wait_for(lambda: count(path, "tracks") >= 20, service)
+        wait_for(lambda: count(path, "tracks") >= 20, fresh)
         recorder.send_signal(signal.SIGINT)
         recorder.communicate(timeout=DEADLINE_S)
     lines = [line.split() for line in run.stdout.splitlines()]
     assert {(line[1], line[3]) for line in lines} == {("0", "1"), ("1", "1")}
     assert [float(one) for one in lines[-1][5:]] == pytest.approx([100.0, 59.5], abs=0.3)
-    played = result_of(run_here(capsys, "play", path, "--connect", service.endpoint, "--json"))
+    played = result_of(run_here(capsys, "play", path, "--connect", fresh.endpoint, "--json"))
     assert [(one["frames"], one["recorded"], one["equal"]) for one in played["streams"]] == [(20, 20, 20)]
