@@ -41,7 +41,7 @@ def patient() -> Iterator[ServiceProcess]:
 
 @pytest.fixture(scope="module")
 def service() -> Iterator[ServiceProcess]:
-    """A service with its own router, whose frames wait for their clouds; without sessions between the tests."""
+    """A service with its own router, whose frames wait for their clouds."""
     with patient() as process:
         yield process
 
@@ -193,18 +193,16 @@ def test_a_recording_is_played_again_and_again(
     assert one.read_bytes() == two.read_bytes() == (incident.parent / "replay" / "0000.txt").read_bytes()
 
 
-def test_parameters_of_another_session_are_not_recorded(
-    service: ServiceProcess, incident: Path, tmp_path: Path
-) -> None:
+def test_parameters_of_another_session_are_not_recorded(fresh: ServiceProcess, incident: Path, tmp_path: Path) -> None:
     """Of a session that has ended when the service is asked, nothing is recorded that its tracks were not made with."""
     first = next(one for one in RecordingFile(incident) if one.topic == "tracks")
     path = tmp_path / "ended.mcap"
-    with recording(service, path) as process:
-        with Connection(service.endpoint) as connection:
+    with recording(fresh, path) as process:
+        with Connection(fresh.endpoint) as connection:
             sender = connection.plain_sender(f"optipmb/v1/{first.stream}/tracks", first.encoding)
-            wait_for(lambda: sender.wanted, service)
+            wait_for(lambda: sender.wanted, fresh)
             sender.put(first.payload)
-            wait_for(lambda: count(path, "tracks"), service)
+            wait_for(lambda: count(path, "tracks"), fresh)
         process.send_signal(signal.SIGTERM)  # it ends with the answer
         process.communicate(timeout=DEADLINE_S)
     assert {one.topic for one in RecordingFile(path)} == {"tracks"}
