@@ -85,6 +85,7 @@ def test_the_noise_of_generated_scenes_is_theirs() -> None:
     assert found.detection > 0.8
     precision = [one.precision for one in found.bins if one.detections > 50]
     assert precision == sorted(precision)
+    assert all(one.low <= one.score <= one.high for one in found.bins)
 
 
 def test_a_few_gross_errors_do_not_carry_a_spread_away() -> None:
