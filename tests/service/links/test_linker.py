@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 from optipmb_schemas import Tracks, decode, encode, encoding_of
-from optipmb_service.links.inputs import LinkInputs
 from optipmb_service.links.linker import Linker
+from optipmb_service.links.looks import LinkInputs
 from optipmb_service.links.places import WorldFrame
 from optipmb_service.settings import LinkSettings
 from sites import BEGIN_NS, RATE, View, World, circle, copied, corridor, plaza
