@@ -99,6 +99,13 @@ def test_the_default_of_the_service_is_the_one_for_any_detector() -> None:
     assert generic == optipmb.generic_parameters(generic.labels, 0.1, name="generic")
 
 
+@pytest.mark.parametrize("period", [0.02, 0.1, 0.25, 1.0])
+def test_misses_of_a_generic_profile_last_as_long_at_any_rate(period: float) -> None:
+    """A track that is not detected is shown for 0.3 s, within a tenth of a frame, and for one frame at least."""
+    misses = optipmb.generic_parameters(("car",), period).classes["car"].extract_misses - 1
+    assert 0.3 - 0.1 * period <= misses * period < 0.3 + period
+
+
 @pytest.mark.parametrize("profile", PAPER)
 def test_the_profiles_hold_the_papers_table(profile: str) -> None:
     """Every value that the paper's table of parameters gives stands in the profile."""
