@@ -93,7 +93,7 @@ class TrackOptions:
         ),
     ] = None
     min_probability: Annotated[
-        float | None, typer.Option(help="With --rejoin: least probability of a join; default 0.98.", show_default=False)
+        float | None, typer.Option(help="With --rejoin: least probability of a join; default 0.9.", show_default=False)
     ] = None
     places: Annotated[
         Path | None,

@@ -38,7 +38,7 @@ class RejoinOptions:
     """Which tracks are joined."""
 
     gap_s: float = 60.0  # longest gap
-    min_probability: float = 0.98
+    min_probability: float = 0.9
     exits: tuple[Polygon, ...] = ()
     passages: tuple[Passage, ...] = ()
 
