@@ -145,7 +145,9 @@ def _run_rejoining(parameters: Parameters) -> None:
     with_declared(np.zeros(0), np.zeros(0), empty, empty, kinds.declared)
     match(empty, empty, np.zeros(0), np.zeros(0, np.bool_), 0)
     tracker = Tracker(parameters, rejoin=Rejoin(embedding_model="any"))
+    posterior = tracker.initial()
     boxes: dict[str, Any] = {"label": [0], "center": [[0.0, 0.0, 0.0]], "score": [0.9]}
     boxes |= {"embedding": [[1.0, 0.0]], "embedding_model": "any"}
-    frame, _ = make_frame(parameters, stamp_ns=0, labels=("pedestrian",), **boxes)
-    tracker.step(tracker.initial(), frame)
+    for k in range(8):  # until it is decided which object the track is
+        frame, _ = make_frame(parameters, stamp_ns=k * 500_000_000, labels=("pedestrian",), **boxes)
+        posterior = tracker.step(posterior, frame).density

@@ -565,8 +565,8 @@ def rejoin_tracks(
     """
     state = before or Rejoining.empty(len(kinds.kind), density.stamp_ns)
     gap_s = settings.gap_s if density.sensor_motion is None else 0.0
-    # As floats: for whole numbers the kernels would be compiled once more.
-    limits = float(gap_s), settings.min_probability, float(settings.decide_s), settings.most
+    # As these types: for others the kernels would be compiled once more.
+    limits = float(gap_s), settings.min_probability, float(settings.decide_s), int(settings.most)
     looks, vectors, (chosen, measurement) = None, NOTHING, detections
     if (model := settings.embedding_model) is not None and (embedding is not None or state.appearance is not None):
         rows = tracks.detection >= 0
