@@ -22,6 +22,7 @@ from optipmb.filter.geometry import END_OF_CHAIN, block, boxes_overlap, empty_to
 from optipmb.filter.hypotheses import UNLIMITED
 from optipmb.model.errors import EffortError
 from optipmb.model.frame import PLAIN
+from optipmb.model.rows import read_only
 from optipmb.model.stages import Measurements
 from optipmb.model.table import known_length
 
@@ -57,7 +58,7 @@ def preprocess(
     return Measurements(*columns), chosen, frame.score.shape[0] - above, above - chosen.shape[0]
 
 
-NO_NOISE: Final = np.zeros((0, 3))
+NO_NOISE: Final = read_only(np.zeros((0, 3)))
 """In place of the covariances of the positions of a frame where it has none."""
 
 

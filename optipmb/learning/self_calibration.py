@@ -498,11 +498,15 @@ def learn_scatter(
         kept[k, 0], kept[k, 1] = cos * nu_x + sin * nu_y, cos * nu_y - sin * nu_x
         if not prior.confirmed[n] or prior.seen_ns[n] != before_ns or stamp_ns - prior.born_ns[n] < SURE_S * 1e9:
             continue
-        if position.shape[1] > PLAIN and (position[m, 2] != 1.0 or position[m, 4] != 1.0):
-            continue  # with a covariance of its own
+        rho = 1.0
+        if position.shape[1] > PLAIN:
+            more_x, more_y = position[m, 2] - 1.0, position[m, 4] - 1.0
+            rho += more_x + more_y
+            if rho < 1.0 or abs(more_x * more_y - position[m, 3] ** 2) > 1e-9 * rho * rho:
+                continue  # with a covariance of its own, not that of the class, or of a long object across its heading
         usual = table[c].noise_position ** 2
         e_x, e_y = position[m, 0] - objects.mean[k, X], position[m, 1] - objects.mean[k, Y]
-        along = kept[k, 0] * (cos * e_x + sin * e_y)
+        along = kept[k, 0] * (cos * e_x + sin * e_y) / rho
         across = kept[k, 1] * (cos * e_y - sin * e_x)
         out[c, PAIRS] += 1.0
         out[c, ALONG] += min(max(along, 0.0), OUTLYING * learned(known[c], ALONG, usual))
@@ -511,7 +515,8 @@ def learn_scatter(
         of_speed = (cos * prior.covariance[n, V, X] + sin * prior.covariance[n, V, Y]) / spread
         gain = min(max(of_speed * (stamp_ns - before_ns) * 1e-9, 0.0), 1.0)
         for s in range(lagged.shape[1]):
-            product = min(max(kept[k, s] * innovations[b, s], -OUTLYING * spread), OUTLYING * spread)
+            product = kept[k, s] * innovations[b, s] / (rho if s == 0 else 1.0)
+            product = min(max(product, -OUTLYING * spread), OUTLYING * spread)
             products[c, s] -= product / (1.0 + gain) ** 2
     for c in range(out.shape[0]):
         if out[c, PAIRS] > MASS:

@@ -100,6 +100,7 @@ class MeasurementNoise(ParameterTable):
     position: Positive = Field(description="standard deviation of x and of y, m; its square fills R_xy")
     length: NonNegative = Field(
         default=0.0,
+        exclude_if=not_,
         description="of the centre along the heading for each metre of the length, where that is more than `position`",
     )
     velocity: Positive = Field(description="of v_x and of v_y, m/s; unused where a detection has no velocity")

@@ -222,6 +222,8 @@ class ClassTable:
         for c, (p, group) in enumerate(zip(rows, groups, strict=True)):
             shared: dict[str, Any] = {"group": groups.index(group), "group_size": groups.count(group)}
             shared |= {"suppressed_with": suppressed.index(suppressed[c]), "default_size": sizes[c]}
+            if not (parameters.trust_size and parameters.trust_heading):
+                shared["noise_length"] = 0.0
             for name, value in (_values(p) | shared).items():
                 classes[name][c] = value
         confusion = _confusion(classes, np.array([p.class_confusion for p in rows]))

@@ -358,6 +358,21 @@ def test_errors_of_metres_are_learned() -> None:
     assert np.mean(within) > 0.6
 
 
+def test_the_noise_of_long_objects_is_learned_across_their_heading() -> None:
+    """Ships, whose centres are uncertain along the heading, teach the scatter of their boxes across it."""
+    rng, tracker = np.random.default_rng(0), optipmb.OnlineTracker(optipmb.generic_parameters(["boat"], 0.5))
+    for k in range(200):
+        along, across = rng.normal(0.0, 1.0, 4), rng.normal(0.0, 0.8, 4)
+        center = np.column_stack((2.0 * k + along, 100.0 * np.arange(4) + across, np.zeros(4)))
+        boxes = {"center": center, "size": [[25.0, 6.0, 4.0]] * 4, "yaw": np.zeros(4), "score": [0.9] * 4}
+        tracker.update(boxes, t=0.5 * k, label=["boat"] * 4)
+    own = tracker.density.self_calibration
+    assert own is not None
+    pairs, _, across = own.scatter[0]
+    assert pairs > 500.0
+    assert 0.6 < np.sqrt(across / pairs) < 1.0
+
+
 @pytest.mark.parametrize("noise", [0.15, 0.4])
 def test_white_noise_is_learned_and_smoothed(noise: float) -> None:
     """Of objects at constant velocity: the scatter is the noise to a quarter, and tracks are nearer than boxes."""

@@ -59,6 +59,8 @@ for seed, modules in enumerate([optipmb.Modules(), optipmb.Modules(), *baselines
             pose = optipmb.Pose(given.cloud.pose.translation, given.cloud.pose.quaternion)
             cloud = optipmb.PointCloud(read_only(given.cloud.xyz), pose)
         view = optipmb.FieldOfView(pose=here if seed > 4 else None) if seed > 3 else None
+        if seed > 2:
+            columns["position_covariance"] = np.tile(np.eye(3), (len(columns["score"]), 1, 1))
         frame, _ = optipmb.make_frame(parameters, pose=here if seed else None, field_of_view=view, **columns)
         frame = replace(frame, cloud=cloud)  # as where a cloud comes after its frame
         result = tracker.step(density, frame)
