@@ -142,8 +142,8 @@ def _are_records(value: Any) -> bool:
 
 def _of_coco(content: _Record) -> list[_Record]:
     """Return the annotations of COCO with the names of their classes, and the fields of their images."""
-    names = {str(one.get("id")): one.get("name") for one in content["categories"]}
-    images = {str(one.pop("id", None)): one for one in content["images"]}
+    names = {str(one["id"]): one.get("name") for one in content["categories"] if one.get("id") is not None}
+    images = {str(one.pop("id")): one for one in content["images"] if one.get("id") is not None}
     return [
         images.get(str(one.get("image_id")), {}) | one | {"class": names.get(str(one.get("category_id")))}
         for one in content["annotations"]

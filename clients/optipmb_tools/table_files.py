@@ -365,6 +365,7 @@ def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> An
     from pyarrow import csv  # noqa: PLC0415  packages of an extra
 
     ragged: list[Any] = []
+    attributes = [name.strip() for name in options.get("attributes", "").split(",")]  # texts, with their first zeros
 
     def keep(row: Any) -> str:
         ragged.append(row)
@@ -373,7 +374,7 @@ def _read_text(pa: Any, path: Path, kind: str, options: Mapping[str, str]) -> An
     def parsed(decimal: str, *texts: str, threads: bool = True) -> Any:
         blocks, separator = _normal_text(path, _blocks(path, options), kind)
         null = list(NO_VALUE)
-        types = dict.fromkeys(texts, pa.string())
+        types = dict.fromkeys((*texts, *attributes), pa.string())
         convert = csv.ConvertOptions(
             null_values=null, strings_can_be_null=True, decimal_point=decimal, column_types=types
         )

@@ -326,14 +326,14 @@ def test_results_may_have_objects_as_ids(table: Path, tmp_path: Path, capsys: py
 def test_columns_of_a_table_are_attributes(table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Tracks have the text with most evidence of each named column, also where their detection has none."""
     head, *lines = table.read_text().splitlines()
-    known = ["8B 1,7" if k == 0 else "" if k % 3 == 0 else "AB 1,7" for k in range(len(lines))]
+    known = ["8B 1,07" if k == 0 else "" if k % 3 == 0 else "AB 1,07" for k in range(len(lines))]
     rows = [f"{line},{text or ','}" for line, text in zip(lines, known, strict=True)]
     table.write_text("\n".join([f"{head},attributes.plate,number", *rows]))
     words = ("track", table, "--out", tmp_path / "tracks.csv")
     assert run_here(capsys, *words, "--option", "attributes=attributes.plate, number").returncode == 0
-    columns = read_table(tmp_path / "tracks.csv", {})
+    columns = read_table(tmp_path / "tracks.csv", {"attributes": "attributes.number"})
     assert set(columns["attributes.plate"][columns["age"] > 1.0].tolist()) == {"AB 1"}
-    assert set(columns["attributes.number"][columns["age"] > 1.0].tolist()) == {7}
+    assert set(columns["attributes.number"][columns["age"] > 1.0].tolist()) == {"07"}
     done = run_here(capsys, *words, "--option", "attributes=colour")
     assert done.returncode == 2
     assert "a column colour (--option attributes)" in done.stderr

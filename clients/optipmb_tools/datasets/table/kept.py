@@ -29,8 +29,9 @@ def step(reading: Reading, draft: Draft) -> Draft:
         kept = leave_out(reading, kept, _slots(reading, draft), "at 0, 0 of a list that is not full")
     if draft.scored:
         kept = leave_out(reading, kept, _doubled(draft), "that another one repeats")
-    read = {draft.roles[role].name: np.empty(0) for role in _READ if role in draft.roles}
-    return replace(draft, columns=draft.columns | read, kept=_valid(reading, draft, kept))
+    read = {draft.roles[role].name for role in _READ if role in draft.roles}
+    read -= set(map(str.strip, reading.options.get("attributes", "").split(",")))
+    return replace(draft, columns=draft.columns | dict.fromkeys(read, np.empty(0)), kept=_valid(reading, draft, kept))
 
 
 def boxes(reading: Reading, draft: Draft) -> Draft:
