@@ -345,6 +345,8 @@ class Tracker:
 
 def _of_present(attributes: Attributes, density: Density) -> Attributes | None:
     """Return the attributes of the newest objects of a density and of lost ones; None: there are none."""
-    lost = () if density.rejoining is None else density.rejoining.lost.id
-    newest = np.intersect1d(attributes.id, np.concatenate((density.bernoulli.id, lost)))[-MOST_OBJECTS:]
+    known = density.bernoulli.id
+    if density.rejoining is not None:
+        known = np.concatenate((known, density.rejoining.lost.id))
+    newest = np.intersect1d(attributes.id, known)[-MOST_OBJECTS:]
     return attributes.take(np.isin(attributes.id, newest)) if len(newest) else None

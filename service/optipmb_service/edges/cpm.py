@@ -123,6 +123,7 @@ class Station:
         if is_correction or is_late or not self._pace.passes(self._stream, stamp_ns):
             return
         self._newest = tracks.session, stamp_ns
+        rotations = int(tracks.id.max(initial=0)) // NUMBERS % 256
         if tracks.object is not None:  # one id over gaps, as in GeoJSON and ROS 2
             numbers = np.where(tracks.object >= 0, tracks.object, tracks.id)
             tracks = tracks.model_copy(update={"id": numbers})
@@ -136,7 +137,6 @@ class Station:
             self._sensors_s = now
             parts = parts or [[]]
         leaps = int(np.searchsorted(LEAPS_S, now, side="right"))
-        rotations = int(tracks.id.max(initial=0)) // NUMBERS % 256
         for number, part in enumerate(parts, 1):
             management: dict[str, Any] = {
                 "reference_time": stamp_ns // 10**6 + 1000 * (leaps - EPOCH_S),

@@ -1,6 +1,6 @@
 """Session: the tracking of one stream, or of several sensors that feed one density.
 
-No I/O and no threads. Of the clock it reads only how long steps take.
+No I/O and no threads. Of the clock it reads only how long steps and flushes take.
 
 Conventions: `now_ns` is the local monotonic clock, given by the caller and used only for waiting, for point clouds and,
 during recovery, for frames that were missed; everything else follows from the messages. So the same messages give the
