@@ -29,9 +29,9 @@ def judged() -> gaps.Judged:
 
 def test_most_gaps_are_joined_and_nearly_all_joins_are_right() -> None:
     """At the default probability 97.5 % of the joins are right, and 65 % of the gaps of 2 to 5 s are joined."""
-    right, wrong, _ = judged().counts(0.98)
+    right, wrong, _ = judged().counts(RejoinOptions.min_probability)
     assert right / (right + wrong) >= 0.975
-    share, count = judged().share(2.0, 5.0, 0.98)
+    share, count = judged().share(2.0, 5.0, RejoinOptions.min_probability)
     assert count > 1000
     assert share >= 0.65
 
