@@ -279,7 +279,7 @@ def draw_runs(folder: Path) -> None:
     examples = Path(__file__).parent.parent / "examples"
     crossing = [f"{examples}/crossing.csv"]
     truth = ["--truth", f"{examples}/crossing_truth.csv"]
-    scene = ["--dataset", "scene", "--option", "seed=4"]
+    scene = ["--dataset", "scene", "--option", "seed=4", "--option", "frames=90"]
     with tempfile.TemporaryDirectory() as place:
         for data, known, name in ((scene, [], "demo.gif"), (crossing, truth, "getting-started.png")):
             tracks = f"{place}/{name}.csv"
