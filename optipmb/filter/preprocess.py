@@ -132,8 +132,12 @@ def long_for_noise(length: float, own: ClassRow) -> bool:
 def write_noise(noise: Array, length: float, yaw: float, own: ClassRow, position: Array) -> None:
     """Write the covariance of a detection, relative to R_xy of its class, behind its position.
 
-    That is `noise`, R_xx, R_xy and R_yy in m^2, where it is known. Else the centre of a long object is off along it, by
-    as much as its length tells; in each direction where the heading is not known.
+    That is `noise`, R_xx, R_xy and R_yy in m^2, where it is known. Else the centre of an object of length L is off
+    along its heading, the unit vector a, by kappa L with kappa = `noise_length`, where that is more than sigma:
+
+        R_xy = sigma^2 I + (kappa^2 L^2 - sigma^2) a a^T        (extends eq. Single Object Measurement Model)
+
+    and R_xy = kappa^2 L^2 I where the heading is not known.
     """
     variance = own.noise_position * own.noise_position
     if not math.isnan(noise[0]):
